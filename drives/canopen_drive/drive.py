@@ -1,0 +1,385 @@
+"""One drive: its objects by SDO, its identity, its units."""
+
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from canopen.objectdictionary import (
+    ObjectDictionary,
+    ODArray,
+    ODRecord,
+    ODVariable,
+    datatypes,
+    import_od,
+)
+from canopen.sdo import SdoAbortedError, SdoCommunicationError
+
+from drives import objects
+from drives.api import AxisLimits, DriveIdentity
+from drives.canopen_drive.line import Line, Node
+from drives.cia402 import Mode, PowerState, emergency_text
+from drives.errors import (
+    DriveFaultError,
+    DrivesError,
+    NodeAbsentError,
+    NothingMovedError,
+    NotSupportedError,
+    ProfileError,
+    SdoAbortError,
+    SdoError,
+    SdoTimeoutError,
+    WrongDeviceError,
+)
+from drives.objects import DATA_TYPES, DataType, ObjectAddress, ObjectInfo
+from drives.profile import AxisProfile, DriveProfile
+from drives.units import AxisScaling, position_factor
+
+logging.getLogger("canopen").setLevel(logging.CRITICAL)  # what goes wrong is raised, not logged
+
+CIA402_DEVICE = 402
+_TYPE_OF_CODE: dict[int, DataType] = {
+    getattr(datatypes, name): name for name in DATA_TYPES if hasattr(datatypes, name)
+}
+
+
+class CanopenDrive:
+    """A CiA 402 drive behind SDO; enabling and motion belong to ``CanopenMotion``."""
+
+    def __init__(self, line: Line, axis: AxisProfile, profile: DriveProfile) -> None:
+        self.line, self.profile, self._axis = line, profile, axis
+        self.dictionary = _read_eds(profile)
+        self.node = Node(axis.node_id, ObjectDictionary())
+        line.add_node(self.node)
+        self._identity: DriveIdentity | None = None
+        self._scaling: AxisScaling | None = None
+        self._rated_torque = 0.0
+
+    @property
+    def axis(self) -> str:
+        """Name of the axis."""
+        return self._axis.name
+
+    @property
+    def axis_profile(self) -> AxisProfile:
+        """What the machine profile says of the axis."""
+        return self._axis
+
+    @property
+    def node_id(self) -> int:
+        """CANopen node id."""
+        return self._axis.node_id
+
+    @property
+    def limits(self) -> AxisLimits:
+        """What the axis may do."""
+        limits = self._axis.limits
+        return AxisLimits(
+            limits.travel,
+            limits.velocity,
+            limits.acceleration,
+            limits.torque,
+            limits.following_error,
+        )
+
+    @property
+    def identity(self) -> DriveIdentity:
+        """What the drive says of itself; known once :meth:`identify` was called."""
+        if self._identity is None:
+            raise NothingMovedError(f"{self.axis}: the drive was not identified yet")
+        return self._identity
+
+    @property
+    def scaling(self) -> AxisScaling:
+        """Worth of the drive's units; known once :meth:`read_scaling` was called."""
+        if self._scaling is None:
+            raise NothingMovedError(f"{self.axis}: the drive's units were not read yet")
+        return self._scaling
+
+    @property
+    def rated_torque(self) -> float:
+        """N m or N that 1000 per mille of torque are."""
+        return self._rated_torque
+
+    # --- objects -------------------------------------------------------------------------------
+
+    def info(self, address: ObjectAddress) -> ObjectInfo | None:
+        """Return what the EDS says of an object, None if it has none."""
+        variable = self._variable(address)
+        if variable is None or variable.data_type not in _TYPE_OF_CODE:
+            return None
+        return ObjectInfo(address, _TYPE_OF_CODE[variable.data_type], variable.name)
+
+    def writable_parameters(self) -> Iterator[ObjectInfo]:
+        """Yield every object that the EDS calls writable and that is a parameter, not a command.
+
+        Objects of the communication profile stay out from 0x1200 to 0x1FFF (SDO and PDO set-up
+        belongs to whoever uses the bus), and so do the profile's ``volatile_commands``.
+        """
+        for index in sorted(self.dictionary):
+            if 0x1200 <= index < 0x2000:
+                continue
+            entry = self.dictionary[index]
+            variables = entry.values() if isinstance(entry, ODRecord | ODArray) else [entry]
+            for variable in variables:
+                address = ObjectAddress(variable.index, variable.subindex)
+                info = self.info(address)
+                if (
+                    info is not None
+                    and variable.access_type in ("rw", "rww", "rwr")
+                    and address not in self.profile.volatile_commands
+                ):
+                    yield info
+
+    def read(self, info: ObjectInfo, timeout: float | None = None) -> int | float | str:
+        """Read an object.
+
+        Raises
+        ------
+        SdoAbortError, SdoTimeoutError, SdoError
+            If the drive refuses, does not answer, or answers something else.
+        """
+        address = info.address
+        with self._asking(address, "read", timeout):
+            data = self.node.sdo.upload(address.index, address.subindex)
+        try:
+            return info.decode(data)
+        except ValueError as error:
+            raise SdoError(self.axis, address.index, address.subindex, f"{error}.") from None
+
+    def read_int(self, info: ObjectInfo) -> int:
+        """Read an object that holds a whole number."""
+        value = self.read(info)
+        if not isinstance(value, int):
+            raise SdoError(
+                self.axis,
+                info.address.index,
+                info.address.subindex,
+                f"holds {value!r}, a whole number was expected.",
+            )
+        return value
+
+    def read_optional(self, info: ObjectInfo) -> int | None:
+        """Read an object that some drives lack; None if this one does."""
+        try:
+            return self.read_int(info)
+        except SdoAbortError as error:
+            if error.code in (0x06020000, 0x06090011):
+                return None
+            raise
+
+    def write(self, info: ObjectInfo, value: float | str, timeout: float | None = None) -> None:
+        """Write an object.
+
+        Raises
+        ------
+        SdoAbortError, SdoTimeoutError, SdoError
+            If the drive refuses or does not answer, or the value does not fit the type.
+        """
+        address = info.address
+        try:
+            data = info.encode(value)
+        except ValueError as error:
+            raise SdoError(self.axis, address.index, address.subindex, f"{error}.") from None
+        with self._asking(address, "write", timeout):
+            self.node.sdo.download(address.index, address.subindex, data)
+
+    @contextmanager
+    def _asking(self, address: ObjectAddress, verb: str, timeout: float | None) -> Iterator[None]:
+        place = (self.axis, address.index, address.subindex)
+        client = self.node.sdo
+        before = client.RESPONSE_TIMEOUT
+        try:
+            if timeout is not None:
+                client.RESPONSE_TIMEOUT = timeout
+            yield
+        except SdoAbortedError as error:
+            raise SdoAbortError(*place, error.code, verb) from None
+        except SdoCommunicationError as error:
+            if "No SDO response" in str(error):
+                raise SdoTimeoutError(
+                    *place,
+                    f"node {self.node_id} did not answer within {client.RESPONSE_TIMEOUT:g} s. "
+                    "Check its supply, cable and bit rate.",
+                ) from None
+            raise SdoError(*place, f"the drive's answer was wrong: {error}.") from None
+        finally:
+            client.RESPONSE_TIMEOUT = before
+
+    def _variable(self, address: ObjectAddress) -> ODVariable | None:
+        variable = self.dictionary.get_variable(address.index, address.subindex)
+        return variable if isinstance(variable, ODVariable) else None
+
+    # --- who and what --------------------------------------------------------------------------
+
+    def identify(self) -> DriveIdentity:
+        """Read who the drive is and compare it with its profiles.
+
+        Raises
+        ------
+        NodeAbsentError
+            If the node does not answer.
+        WrongDeviceError
+            If it is no CiA 402 drive, or not the one that the profile describes.
+        """
+        device_type = self._first_answer()
+        if device_type & 0xFFFF != CIA402_DEVICE:
+            raise WrongDeviceError(
+                f"{self.axis}: node {self.node_id} is no CiA 402 drive: device type 0x1000 is "
+                f"0x{device_type:08X} (profile number {device_type & 0xFFFF}). Check the node ids."
+            )
+        self._identity = DriveIdentity(
+            device_type,
+            self.read_optional(objects.VENDOR_ID) or 0,
+            self.read_optional(objects.PRODUCT_CODE) or 0,
+            self.read_optional(objects.REVISION) or 0,
+            self.read_optional(objects.SERIAL_NUMBER) or 0,
+            self._text(objects.DEVICE_NAME),
+            self._text(objects.FIRMWARE_VERSION),
+        )
+        wanted = self.profile.identity
+        for what, expected, found in (
+            ("device type 0x1000", wanted.device_type, self._identity.device_type),
+            ("vendor-ID 0x1018:01", wanted.vendor_id, self._identity.vendor_id),
+            ("product code 0x1018:02", wanted.product_code, self._identity.product_code),
+            ("serial number 0x1018:04", self._axis.serial_number, self._identity.serial_number),
+        ):
+            if expected is not None and expected != found:
+                raise WrongDeviceError(
+                    f"{self.axis}: node {self.node_id} is another device than profile "
+                    f"{self.profile.name} says: {what} is 0x{found:08X}, expected "
+                    f"0x{expected:08X}. Check the node id and the machine profile."
+                )
+        return self._identity
+
+    def _first_answer(self) -> int:
+        try:
+            return self.read_int(objects.DEVICE_TYPE)
+        except SdoTimeoutError:
+            self.node.nmt.send_command(0x80)  # a stopped node answers no SDO
+        try:
+            return self.read_int(objects.DEVICE_TYPE)
+        except SdoTimeoutError:
+            raise NodeAbsentError(
+                f"{self.axis}: node {self.node_id} does not answer. Check its supply, its cable, its "
+                "node id and the bit rate."
+            ) from None
+
+    def _text(self, info: ObjectInfo) -> str:
+        try:
+            return str(self.read(info))
+        except SdoAbortError:
+            return ""
+
+    def read_scaling(self) -> AxisScaling:
+        """Read what the drive's position and torque units are worth.
+
+        Raises
+        ------
+        NotSupportedError
+            If the rated torque or the encoder's resolution is zero or missing: without them no
+            number from this drive means anything.
+        """
+        rated = self.read_optional(objects.RATED_TORQUE)
+        if not rated:
+            raise NotSupportedError(
+                f"{self.axis}: motor rated torque 0x6076 is "
+                f"{'missing' if rated is None else 'zero'}, so torques have no scale. Enter the "
+                "motor's data in the drive first."
+            )
+        self._rated_torque = rated * self.profile.rated_torque_unit
+        counts = self.read_optional(objects.ENCODER_COUNTS) or 0
+        revolutions = self.read_optional(objects.ENCODER_REVOLUTIONS) or 1
+        gear = (
+            self.read_optional(objects.GEAR_MOTOR) or 1,
+            self.read_optional(objects.GEAR_SHAFT) or 1,
+        )
+        try:
+            position = position_factor(self._axis.kind, counts, revolutions, gear, self._axis.feed)
+        except ValueError as error:
+            raise NotSupportedError(f"{self.axis}: position has no scale: {error}.") from None
+        self._scaling = AxisScaling(position, position, self._rated_torque / 1000)
+        return self._scaling
+
+    def read_position(self) -> float:
+        """Read the actual position 0x6064, rad or m."""
+        return self.read_int(objects.POSITION_ACTUAL) * self.scaling.position
+
+    # --- state ---------------------------------------------------------------------------------
+
+    def power_state(self) -> PowerState:
+        """Read the statusword and return the state it shows."""
+        try:
+            return PowerState.of(self.read_int(objects.STATUSWORD))
+        except ValueError as error:
+            raise DriveFaultError(f"{self.axis}: {error}.") from None
+
+    def check_idle(self) -> None:
+        """Refuse a drive that is in fault, or that somebody else has enabled.
+
+        Raises
+        ------
+        DriveFaultError
+            With the drive's last error.
+        """
+        state = self.power_state()
+        if state in (PowerState.FAULT, PowerState.FAULT_REACTION_ACTIVE):
+            raise DriveFaultError(
+                f"{self.axis}: the drive is in {state.words}; its last error is {self.last_error()}. "
+                "Find the cause and reset the fault before starting again."
+            )
+        if state in (PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE):
+            raise DriveFaultError(
+                f"{self.axis}: the drive is already enabled ({state.words}): somebody else commands "
+                "it. Stop the other controller first."
+            )
+
+    def last_error(self) -> str:
+        """Return the newest entry of the drive's error history 0x1003 in words."""
+        newest = ObjectInfo(ObjectAddress(0x1003, 1), "UNSIGNED32", "standard error field")
+        try:
+            code = self.read_optional(newest)
+        except DrivesError:
+            return "not readable"
+        return emergency_text(code & 0xFFFF) if code else "not recorded"
+
+    def check_mode(self, mode: Mode) -> None:
+        """Refuse a mode that 0x6502 does not offer.
+
+        Raises
+        ------
+        NotSupportedError
+            With the modes that are there.
+        """
+        supported = self.read_optional(objects.SUPPORTED_MODES)
+        if supported is not None and not supported & mode.supported_bit:
+            offered = [m.words for m in Mode if supported & m.supported_bit]
+            raise NotSupportedError(
+                f"{self.axis}: the drive has no mode {mode.words} ({mode.value}); 0x6502 is "
+                f"0x{supported:08X}: {', '.join(offered) or 'none of the modes known here'}."
+            )
+
+    def set_mode(self, mode: Mode, timeout: float = 1.0) -> None:
+        """Set the mode of operation and see it confirmed in 0x6061.
+
+        Raises
+        ------
+        NotSupportedError
+            If the drive does not confirm.
+        """
+        self.write(objects.MODE, mode.value)
+        deadline = self.line.clock.now() + timeout
+        while (shown := self.read_int(objects.MODE_DISPLAY)) != mode.value:
+            if self.line.clock.now() >= deadline:
+                raise NotSupportedError(
+                    f"{self.axis}: mode {mode.words} ({mode.value}) was not taken; 0x6061 shows "
+                    f"{shown} after {timeout:g} s."
+                )
+            self.line.wait(0.005)
+
+
+def _read_eds(profile: DriveProfile) -> ObjectDictionary:
+    path = profile.path.parent / profile.eds
+    try:
+        return import_od(str(path))
+    except Exception as error:  # the EDS reader raises whatever its parser stumbles upon
+        raise ProfileError(profile.path, f"eds {profile.eds} can not be read: {error!r}") from None

@@ -1,0 +1,179 @@
+"""All drives of a machine: connected, checked, and put back as they were."""
+
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+
+import can
+
+from drives.bus import CyclicLoad, check_cycle, open_bus, shortest_cycle
+from drives.canopen_drive import setup
+from drives.canopen_drive.drive import CanopenDrive
+from drives.canopen_drive.line import Line
+from drives.canopen_drive.motion import CanopenMotion
+from drives.cia402 import Mode
+from drives.errors import DrivesError, LimitsError, NothingMovedError
+from drives.profile import DriveProfile, MachineProfile, load_drive
+
+START_NODE, ENTER_PRE_OPERATIONAL = 0x01, 0x80
+
+
+def _never() -> bool:
+    return False
+
+
+class CanopenGroup:
+    """The identified drives of one machine; made by :func:`connect`."""
+
+    def __init__(
+        self,
+        line: Line,
+        machine: MachineProfile,
+        drives: Sequence[CanopenDrive],
+        stop_requested: Callable[[], bool],
+    ) -> None:
+        self.line, self.machine = line, machine
+        self._drives, self._stop_requested = tuple(drives), stop_requested
+        self.warnings: list[str] = []
+        """What could not be put back, in words."""
+
+    @property
+    def drives(self) -> tuple[CanopenDrive, ...]:
+        """One drive an axis, in the machine profile's order."""
+        return self._drives
+
+    @property
+    def axes(self) -> tuple[str, ...]:
+        """Names of the axes, in the machine profile's order."""
+        return tuple(d.axis for d in self._drives)
+
+    @property
+    def shortest_cycle(self) -> float:
+        """Shortest cycle time that fits the bus, seconds."""
+        return shortest_cycle(len(self._drives), self.machine.bus.bitrate)
+
+    @contextmanager
+    def motion(self, cycle_time: float, free: Collection[str] = ()) -> Iterator[CanopenMotion]:
+        """Enable all axes: those in ``free`` float without torque, the others hold position.
+
+        Whatever happens inside, on leaving the axes are stopped and disabled, and the drives'
+        PDOs and fail-safe objects are what they were.
+
+        Parameters
+        ----------
+        cycle_time
+            Seconds from SYNC to SYNC.
+        free
+            Names of axes in cyclic torque mode with zero torque.
+
+        Raises
+        ------
+        LimitsError
+            If the cycle does not fit the bus, or an axis may not float.
+        NothingMovedError
+            If a drive can not be enabled.
+        """
+        self._check(cycle_time, free)
+        with ExitStack() as stack:
+            for drive in self._drives:
+                changes = setup.TemporaryObjects(drive)
+                stack.callback(self._put_back, changes)
+                mode = Mode.CYCLIC_TORQUE if drive.axis in free else Mode.CYCLIC_POSITION
+                setup.cycle(drive, cycle_time, changes)
+                setup.process_data(drive, changes)
+                drive.set_mode(mode)
+                setup.fail_safe(drive, changes)
+            for drive in self._drives:
+                stack.callback(self._leave_operational, drive)
+            for drive in self._drives:
+                drive.node.nmt.send_command(START_NODE)
+            motion = CanopenMotion(
+                self.line, self._drives, cycle_time, frozenset(free), self._stop_requested
+            )
+            stack.callback(motion.end)
+            try:
+                motion.begin()
+                yield motion
+            except BaseException:
+                motion.stop()
+                raise
+
+    def _check(self, cycle_time: float, free: Collection[str]) -> None:
+        check_cycle(CyclicLoad(len(self._drives), cycle_time, self.machine.bus.bitrate))
+        for axis in free:
+            if axis not in self.axes:
+                raise LimitsError(f"{axis} is no axis of machine {self.machine.name}")
+        for drive in self._drives:
+            low, high = drive.limits.travel
+            if drive.axis in free and not drive.axis_profile.may_float:
+                raise LimitsError(
+                    f"{drive.axis}: may not float (`may_float` in the machine profile is not true), "
+                    "so it can not be left without torque."
+                )
+            drive.check_idle()
+            drive.check_mode(Mode.CYCLIC_TORQUE if drive.axis in free else Mode.CYCLIC_POSITION)
+            position = drive.read_position()
+            if not low <= position <= high:
+                unit = "rad" if drive.axis_profile.kind == "rotary" else "m"
+                raise LimitsError(
+                    f"{drive.axis}: stands at {position:.4g} {unit}, outside its travel {low:g} to "
+                    f"{high:g} {unit}. Move it back by hand or with the machine's own controller."
+                )
+
+    def _put_back(self, changes: setup.TemporaryObjects) -> None:
+        self.warnings += [f"could not be put back: {text}" for text in changes.put_back()]
+
+    def _leave_operational(self, drive: CanopenDrive) -> None:
+        try:
+            drive.node.nmt.send_command(ENTER_PRE_OPERATIONAL)
+        except DrivesError as error:
+            self.warnings.append(f"{drive.axis}: {error}")
+
+
+@contextmanager
+def connect(
+    machine: MachineProfile,
+    bus: can.BusABC | None = None,
+    stop_requested: Callable[[], bool] = _never,
+) -> Iterator[CanopenGroup]:
+    """Open the machine's bus, and identify every drive on it; nothing moves and nothing is written.
+
+    Parameters
+    ----------
+    machine
+        The machine profile.
+    bus
+        A bus that is open already, and stays open; else the profile's is opened and closed.
+    stop_requested
+        Asked in every cycle of a motion: whether the user wants to stop.
+
+    Raises
+    ------
+    BusError
+        If the bus can not be opened.
+    NothingMovedError
+        If a node is absent, another device, in fault, or has no scales.
+    """
+    profiles: dict[str, DriveProfile] = {}
+    for axis in machine.axes:
+        if axis.node_id == setup.HOST_NODE_ID:
+            raise NothingMovedError(
+                f"{axis.name}: node id {axis.node_id} is the host's own (its heartbeat); give the "
+                "drive another one."
+            )
+        if axis.drive not in profiles:
+            profiles[axis.drive] = load_drive(axis.drive, machine.path)
+    own = open_bus(machine.bus) if bus is None else None
+    line = Line(bus if own is None else own)  # type: ignore[arg-type]
+    try:
+        drives = [CanopenDrive(line, axis, profiles[axis.drive]) for axis in machine.axes]
+        for drive in drives:
+            drive.identify()
+        for drive in drives:
+            drive.check_idle()
+            drive.read_scaling()
+        yield CanopenGroup(line, machine, drives, stop_requested)
+    finally:
+        for node_id in list(line.nodes):
+            del line[node_id]
+        if own is not None:
+            own.shutdown()

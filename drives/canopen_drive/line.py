@@ -1,0 +1,85 @@
+"""One CAN bus, one thread: frames are received when somebody waits for them.
+
+python ``canopen`` usually receives in a thread of its own; a dead thread then looks like a quiet bus
+while periodic frames go on.  Here whoever waits receives, so an error of the bus is raised where
+it matters, and time is the bus' own.
+"""
+
+from collections.abc import Callable
+
+import can
+import canopen
+from canopen.sdo import SdoClient, SdoCommunicationError
+
+from drives.bus import Clock, clock_of
+from drives.errors import BusError
+
+SDO_TIMEOUT = 0.5
+"""Seconds a drive may take for an ordinary SDO answer."""
+
+
+class Line(canopen.Network):  # type: ignore[misc]
+    """A CANopen network whose frames are received by those who wait for them."""
+
+    def __init__(self, bus: can.BusABC) -> None:
+        super().__init__(bus)
+        self.can_bus = bus
+        self.clock: Clock = clock_of(bus)
+
+    def send(self, message: can.Message) -> None:
+        """Send a frame; raise BusError if the bus does not take it."""
+        try:
+            self.can_bus.send(message)
+        except (can.CanError, OSError) as error:
+            raise BusError(f"the bus does not take frames any more: {error}") from error
+
+    def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:
+        """Send a frame by its identifier, as ``canopen`` does it."""
+        self.send(
+            can.Message(
+                arbitration_id=can_id, data=data, is_extended_id=False, is_remote_frame=remote
+            )
+        )
+
+    def pump(self, timeout: float) -> can.Message | None:
+        """Receive at most one frame, hand it on to those who subscribed, and return it."""
+        try:
+            message = self.can_bus.recv(timeout)
+        except (can.CanError, OSError) as error:
+            raise BusError(f"the bus does not deliver frames any more: {error}") from error
+        if message is not None and not (message.is_error_frame or message.is_remote_frame):
+            self.notify(message.arbitration_id, message.data, message.timestamp)
+        return message
+
+    def wait(self, seconds: float, until: Callable[[], bool] = lambda: False) -> bool:
+        """Receive for so long, or until a condition holds; return whether it does."""
+        deadline = self.clock.now() + seconds
+        while not until():
+            left = deadline - self.clock.now()
+            if left <= 0:
+                return until()
+            self.pump(left)
+        return True
+
+
+class PumpedSdoClient(SdoClient):  # type: ignore[misc]
+    """``canopen``'s SDO client, which receives by itself while it waits."""
+
+    RESPONSE_TIMEOUT = SDO_TIMEOUT
+
+    def read_response(self) -> bytes:
+        """Wait for the answer; raise as ``canopen`` does if there is none."""
+        self.network.wait(self.RESPONSE_TIMEOUT, lambda: not self.responses.empty())
+        if self.responses.empty():
+            raise SdoCommunicationError("No SDO response received")
+        return super().read_response()  # type: ignore[no-any-return]
+
+
+class Node(canopen.RemoteNode):  # type: ignore[misc]
+    """``canopen``'s remote node with the SDO client above."""
+
+    def add_sdo(self, rx_cobid: int, tx_cobid: int) -> PumpedSdoClient:
+        """Add an SDO channel."""
+        client = PumpedSdoClient(rx_cobid, tx_cobid, self.object_dictionary)
+        self.sdo_channels.append(client)
+        return client

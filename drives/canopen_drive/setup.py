@@ -1,0 +1,184 @@
+"""Objects that are changed while the tool runs, and put back afterwards."""
+
+from drives import objects
+from drives.canopen_drive.drive import CanopenDrive
+from drives.errors import DrivesError, NotSupportedError, SdoAbortError
+from drives.objects import ObjectAddress, ObjectInfo, type_bits
+
+PDO_OFF = 1 << 31
+SYNCHRONOUS = 1
+HOST_NODE_ID = 127
+HOST_HEARTBEAT = 0.05
+"""Seconds between the host's heartbeats while the machine moves."""
+HOST_LOST_AFTER = 0.2
+"""Seconds without the host's heartbeat after which a drive stops by itself."""
+DRIVE_HEARTBEAT = 0.1
+"""Seconds between a drive's heartbeats while the machine moves."""
+
+OUTPUTS = (objects.CONTROLWORD, objects.TARGET_POSITION, objects.TARGET_TORQUE)
+INPUTS = (objects.STATUSWORD, objects.POSITION_ACTUAL, objects.TORQUE_ACTUAL)
+
+
+class TemporaryObjects:
+    """Writes that remember what was there, for one drive.
+
+    :meth:`put_back` belongs into a ``finally``.
+    """
+
+    def __init__(self, drive: CanopenDrive) -> None:
+        self._drive = drive
+        self._before: list[tuple[ObjectInfo, int]] = []
+
+    def change(self, info: ObjectInfo, value: int, before: int | None = None) -> None:
+        """Write a value, remembering the one before (read now, unless given)."""
+        if before is None:
+            before = self._drive.read_int(info)
+        if before == value:
+            return
+        self._before.append((info, before))
+        self._drive.write(info, value)
+        found = self._drive.read_int(info)
+        if found != value:
+            raise NotSupportedError(
+                f"{self._drive.axis}, object {info.address} ({info.name}): wrote {value}, the drive "
+                f"holds {found}. It can not be used safely."
+            )
+
+    def note(self, info: ObjectInfo, before: int) -> None:
+        """Remember a value to be written when all is put back."""
+        self._before.append((info, before))
+
+    def put_back(self) -> list[str]:
+        """Write all old values, newest first; return what failed, in words."""
+        failures = []
+        while self._before:
+            info, before = self._before.pop()
+            try:
+                self._drive.write(info, before)
+            except DrivesError as error:
+                failures.append(str(error))
+        return failures
+
+
+def fail_safe(drive: CanopenDrive, changes: TemporaryObjects) -> None:
+    """Make the drive stop by itself when the host's heartbeat is lost (0x1016, 0x6007, 0x1029).
+
+    Raises
+    ------
+    NotSupportedError
+        If the drive has no heartbeat consumer: then nothing would stop it when the host dies.
+    """
+    if drive.read_optional(objects.CONSUMER_HEARTBEAT) is None:
+        raise NotSupportedError(
+            f"{drive.axis}: the drive has no heartbeat consumer 0x1016, so nothing would stop it when "
+            "the host dies. It may not be moved by this tool."
+        )
+    if drive.read_optional(objects.ABORT_CONNECTION) is None:
+        raise NotSupportedError(
+            f"{drive.axis}: the drive has no abort connection option 0x6007, so what it does when the "
+            "host dies is not known. It may not be moved by this tool."
+        )
+    changes.change(objects.ABORT_CONNECTION, drive.profile.heartbeat_reaction)
+    behaviour = drive.profile.error_behaviour
+    if behaviour is not None and drive.read_optional(objects.ERROR_BEHAVIOUR) is not None:
+        changes.change(objects.ERROR_BEHAVIOUR, behaviour)
+    changes.change(objects.PRODUCER_HEARTBEAT, round(DRIVE_HEARTBEAT * 1000))
+    changes.change(objects.CONSUMER_HEARTBEAT, (HOST_NODE_ID << 16) | round(HOST_LOST_AFTER * 1000))
+
+
+def cycle(drive: CanopenDrive, cycle_time: float, changes: TemporaryObjects) -> None:
+    """Tell the drive the time between targets (0x60C2, and 0x1006 where it is in use).
+
+    Raises
+    ------
+    NotSupportedError
+        If the cycle time is no whole number of the profile's unit.
+    """
+    exponent = drive.profile.interpolation_index
+    value = cycle_time / 10.0**exponent
+    if abs(value - round(value)) > 1e-6 or not 1 <= round(value) <= 255:
+        raise NotSupportedError(
+            f"{drive.axis}: a cycle of {cycle_time * 1000:g} ms is not 1 to 255 times "
+            f"{10.0**exponent:g} s, as 0x60C2 needs it."
+        )
+    changes.change(objects.INTERPOLATION_INDEX, exponent)
+    changes.change(objects.INTERPOLATION_VALUE, round(value))
+    period = drive.read_optional(objects.SYNC_PERIOD)
+    if period:
+        changes.change(objects.SYNC_PERIOD, round(cycle_time * 1e6), period)
+
+
+def process_data(drive: CanopenDrive, changes: TemporaryObjects) -> None:
+    """Map one PDO each way, 8 bytes, taken over at every SYNC; switch the drive's others off.
+
+    Raises
+    ------
+    NotSupportedError
+        If the drive's types do not fill the 8 bytes as the tool sends them.
+    SdoError
+        If the drive refuses the mapping.
+    """
+    for wanted in (*OUTPUTS, *INPUTS):
+        info = drive.info(wanted.address)
+        if info is not None and type_bits(info.type) != type_bits(wanted.type):
+            raise NotSupportedError(
+                f"{drive.axis}, object {wanted.address} ({wanted.name}): the drive has "
+                f"{info.type}, the tool's PDOs need {wanted.type}."
+            )
+    for communication, mapping, cob_id, entries in (
+        (0x1400, 0x1600, 0x200, OUTPUTS),
+        (0x1800, 0x1A00, 0x180, INPUTS),
+    ):
+        for other in range(3, 0, -1):
+            _switch_off(drive, communication + other, changes)
+        _map(drive, communication, mapping, cob_id + drive.node_id, entries, changes)
+
+
+def _switch_off(drive: CanopenDrive, communication: int, changes: TemporaryObjects) -> None:
+    info = _cob_id(communication)
+    before = drive.read_optional(info)
+    if before is not None and not before & PDO_OFF:
+        changes.change(info, before | PDO_OFF, before)
+
+
+def _map(
+    drive: CanopenDrive,
+    communication: int,
+    mapping: int,
+    cob_id: int,
+    entries: tuple[ObjectInfo, ...],
+    changes: TemporaryObjects,
+) -> None:
+    identifier = _cob_id(communication)
+    kind = ObjectInfo(ObjectAddress(communication, 2), "UNSIGNED8", "PDO transmission type")
+    count = ObjectInfo(ObjectAddress(mapping, 0), "UNSIGNED8", "number of mapped objects")
+    old_identifier, old_count = drive.read_int(identifier), drive.read_int(count)
+    old_entries = [drive.read_int(_entry(mapping, k + 1)) for k in range(old_count)]
+    # Put back in reverse: off, count 0, entries, count, type, on.  CiA 301, clause 7.5.2.36.
+    changes.note(identifier, old_identifier)
+    changes.note(count, old_count)
+    for k, old in enumerate(old_entries):
+        changes.note(_entry(mapping, k + 1), old)
+    changes.note(count, 0)
+    drive.write(identifier, (old_identifier | PDO_OFF) & 0xFFFFFFFF)
+    changes.note(identifier, (old_identifier | PDO_OFF) & 0xFFFFFFFF)
+    changes.change(kind, SYNCHRONOUS)
+    drive.write(count, 0)
+    for k, info in enumerate(entries):
+        address = info.address
+        value = address.index << 16 | address.subindex << 8 | type_bits(info.type)
+        drive.write(_entry(mapping, k + 1), value)
+    drive.write(count, len(entries))
+    found = [drive.read_int(_entry(mapping, k + 1)) >> 8 for k in range(drive.read_int(count))]
+    wanted = [info.address.index << 8 | info.address.subindex for info in entries]
+    if found != wanted:
+        raise SdoAbortError(drive.axis, mapping, 0, 0x06040041, "map")
+    drive.write(identifier, cob_id)
+
+
+def _cob_id(communication: int) -> ObjectInfo:
+    return ObjectInfo(ObjectAddress(communication, 1), "UNSIGNED32", "COB-ID of PDO")
+
+
+def _entry(mapping: int, k: int) -> ObjectInfo:
+    return ObjectInfo(ObjectAddress(mapping, k), "UNSIGNED32", f"mapped object {k}")

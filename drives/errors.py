@@ -1,0 +1,155 @@
+"""What drives, buses and their profiles can do wrong, as a tree.
+
+::
+
+    DrivesError
+    ├── ProfileError              a profile is wrong: file, line, key, value, what to do
+    ├── BusError                  the bus can not be opened, or is gone
+    ├── NothingMovedError         refused before any motion
+    │   ├── NodeAbsentError       no answer from a node
+    │   ├── WrongDeviceError      another device than the profile says
+    │   ├── NotSupportedError     the drive has no such mode or object
+    │   ├── DriveFaultError       the drive is in fault, or does not follow the controlword
+    │   └── LimitsError           limits missing, or the cycle does not fit the bus
+    ├── SdoError                  an object could not be read or written
+    │   ├── SdoAbortError         the drive refused: abort code and its meaning
+    │   └── SdoTimeoutError       the drive did not answer
+    ├── StoppedError              the machine was stopped while it moved
+    │   ├── SafetyStopError       by a limit or a fault
+    │   └── UserStopError         by the user
+    ├── WriteBackError            writing failed and everything was restored
+    └── WriteBackMixedError       writing failed and could not be restored
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+
+class DrivesError(Exception):
+    """Root; the message is one sentence for a person."""
+
+
+class ProfileError(DrivesError):
+    """A profile is not what it should be."""
+
+    def __init__(self, path: Path | str, message: str, line: int | None = None) -> None:
+        self.path, self.line = Path(path), line
+        super().__init__(f"{path}:{line}: {message}" if line else f"{path}: {message}")
+
+
+class BusError(DrivesError):
+    """The bus can not be opened, or does not carry frames any more."""
+
+
+class NothingMovedError(DrivesError):
+    """Refused before any motion."""
+
+
+class NodeAbsentError(NothingMovedError):
+    """No answer from a node."""
+
+
+class WrongDeviceError(NothingMovedError):
+    """The node is another device than the profile says."""
+
+
+class NotSupportedError(NothingMovedError):
+    """The drive has no such mode or object."""
+
+
+class DriveFaultError(NothingMovedError):
+    """The drive is in fault, or does not reach the state asked for."""
+
+
+class LimitsError(NothingMovedError):
+    """A limit is missing or would be left, or the cycle does not fit the bus."""
+
+
+class SdoError(DrivesError):
+    """An object could not be read or written."""
+
+    def __init__(self, axis: str, index: int, subindex: int, message: str) -> None:
+        self.axis, self.index, self.subindex = axis, index, subindex
+        super().__init__(f"{axis}, object 0x{index:04X}:{subindex:02X}: {message}")
+
+
+class SdoAbortError(SdoError):
+    """The drive refused, with an SDO abort code (CiA 301, table of abort codes)."""
+
+    def __init__(self, axis: str, index: int, subindex: int, code: int, verb: str) -> None:
+        self.code = code
+        meaning = ABORT_CODES.get(code, "meaning unknown")
+        super().__init__(
+            axis, index, subindex, f"the drive refused to {verb} it: {meaning} (0x{code:08X})."
+        )
+
+
+class SdoTimeoutError(SdoError):
+    """The drive did not answer within the time-out."""
+
+
+class StoppedError(DrivesError):
+    """The machine was stopped while it moved; what was recorded until then is kept."""
+
+    capture: object = None
+    """``drives.api.Capture`` of the stream that was cut short, if there was one."""
+
+
+class SafetyStopError(StoppedError):
+    """A limit was passed, or a drive failed, while the machine moved; all axes were stopped."""
+
+    def __init__(self, message: str, *, axis: str | None = None, cycle: int | None = None) -> None:
+        self.axis, self.cycle = axis, cycle
+        super().__init__(message)
+
+
+class UserStopError(StoppedError):
+    """The user asked to stop; all axes were stopped."""
+
+
+class WriteBackError(DrivesError):
+    """Writing parameters failed; every drive holds its old values again."""
+
+
+class WriteBackMixedError(DrivesError):
+    """Writing parameters failed and not everything could be restored."""
+
+    def __init__(self, message: str, holds: Mapping[str, str]) -> None:
+        self.holds = dict(holds)
+        super().__init__(message)
+
+
+ABORT_CODES = {
+    0x05030000: "toggle bit not alternated",
+    0x05040000: "SDO protocol timed out",
+    0x05040001: "command specifier not valid",
+    0x05040002: "invalid block size",
+    0x05040003: "invalid sequence number",
+    0x05040004: "CRC error",
+    0x05040005: "out of memory",
+    0x06010000: "access not supported",
+    0x06010001: "the object is write-only",
+    0x06010002: "the object is read-only",
+    0x06020000: "the object does not exist",
+    0x06040041: "the object can not be mapped to the PDO",
+    0x06040042: "the mapped objects exceed the PDO's length",
+    0x06040043: "general parameter incompatibility",
+    0x06040047: "general internal incompatibility",
+    0x06060000: "hardware error",
+    0x06070010: "length of the value does not match",
+    0x06070012: "the value is too long",
+    0x06070013: "the value is too short",
+    0x06090011: "the sub-index does not exist",
+    0x06090030: "the value is not allowed",
+    0x06090031: "the value is too high",
+    0x06090032: "the value is too low",
+    0x06090036: "maximum is less than minimum",
+    0x060A0023: "resource not available",
+    0x08000000: "general error",
+    0x08000020: "data can not be transferred or stored",
+    0x08000021: "data can not be stored because of local control",
+    0x08000022: "not in the present state of the drive",
+    0x08000023: "no object dictionary",
+    0x08000024: "no data available",
+}
+"""SDO abort code: meaning (CiA 301, clause 7.2.4.3.17)."""

@@ -1,0 +1,136 @@
+"""The only place with conversion factors: quantities of profiles, and drive units to SI and back.
+
+Inside everything is SI: rad, rad/s, N m on rotary axes; m, m/s, N on linear ones.
+"""
+
+import re
+from dataclasses import dataclass
+from math import pi
+from typing import Literal
+
+Kind = Literal["rotary", "linear"]
+
+UNITS: dict[str, dict[str, float]] = {
+    "angle": {"rad": 1.0, "mrad": 1e-3, "deg": pi / 180, "rev": 2 * pi},
+    "length": {"m": 1.0, "mm": 1e-3, "um": 1e-6},
+    "angular velocity": {
+        "rad/s": 1.0,
+        "deg/s": pi / 180,
+        "rpm": 2 * pi / 60,
+        "rev/s": 2 * pi,
+    },
+    "velocity": {"m/s": 1.0, "mm/s": 1e-3, "m/min": 1 / 60},
+    "angular acceleration": {"rad/s2": 1.0, "deg/s2": pi / 180, "rev/s2": 2 * pi},
+    "acceleration": {"m/s2": 1.0, "mm/s2": 1e-3},
+    "torque": {"N m": 1.0, "mN m": 1e-3, "kN m": 1e3},
+    "force": {"N": 1.0, "kN": 1e3},
+    "inertia": {"kg m2": 1.0, "kg cm2": 1e-4, "g cm2": 1e-7},
+    "mass": {"kg": 1.0, "g": 1e-3},
+    "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6},
+    "frequency": {"Hz": 1.0, "kHz": 1e3},
+}
+"""Dimension: unit and its value in SI."""
+
+_QUANTITY = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(\S.*?)\s*")
+
+
+def parse_quantity(text: object, *dimensions: str) -> float:
+    """Return the SI value of a text such as ``"90 deg/s"``.
+
+    Parameters
+    ----------
+    text
+        Number and unit.  A bare number is refused: a limit whose unit is guessed is no limit.
+    dimensions
+        Keys of ``UNITS`` that are allowed.
+
+    Raises
+    ------
+    ValueError
+        If there is no number, no unit, or a unit of another dimension.
+    """
+    known = {unit: factor for d in dimensions for unit, factor in UNITS[d].items()}
+    wanted = f"a number with one of the units {', '.join(known)}"
+    if not isinstance(text, str):
+        raise ValueError(f"needs {wanted}, got {text!r}")  # noqa: TRY004
+    match = _QUANTITY.fullmatch(text)
+    if match is None:
+        raise ValueError(f"needs {wanted}, got {text!r}")
+    number, unit = match.groups()
+    unit = unit.replace("·", " ").replace("*", " ").replace("N.m", "N m").replace("²", "2")
+    unit = {"Nm": "N m", "mNm": "mN m", "kNm": "kN m", "kgm2": "kg m2"}.get(unit, unit)
+    if unit not in known:
+        raise ValueError(f"unit {unit!r} does not fit: needs {wanted}")
+    return float(number) * known[unit]
+
+
+@dataclass(frozen=True)
+class AxisScaling:
+    """What one drive's units are worth: SI value = drive value times factor."""
+
+    position: float
+    """rad or m per position unit of 0x6064, 0x607A."""
+    velocity: float
+    """rad/s or m/s per velocity unit of 0x606C."""
+    torque: float
+    """N m or N per unit of 0x6071, 0x6077 (one per mille of the rated torque)."""
+
+    def __post_init__(self) -> None:
+        if not (self.position > 0 and self.velocity > 0 and self.torque > 0):
+            raise ValueError(f"scale factors must be positive, got {self}")
+
+    def position_units(self, value: float) -> int:
+        """Position in drive units, nearest."""
+        return round(value / self.position)
+
+    def torque_units(self, value: float) -> int:
+        """Torque in drive units, nearest."""
+        return round(value / self.torque)
+
+
+def position_factor(
+    kind: Kind, counts: int, revolutions: int, gear: tuple[int, int], feed: float | None
+) -> float:
+    """Return rad (or m) of the axis per position unit.
+
+    Parameters
+    ----------
+    kind
+        Of the axis.
+    counts, revolutions
+        0x608F: encoder increments in so many motor revolutions.
+    gear
+        0x6091: (motor revolutions, shaft revolutions).
+    feed
+        Metres per shaft revolution; needed on linear axes only.
+
+    Raises
+    ------
+    ValueError
+        If a number is zero, or the feed of a linear axis is not known.
+    """
+    if min(counts, revolutions, *gear) <= 0:
+        raise ValueError(
+            f"0x608F = {counts}/{revolutions} and 0x6091 = {gear[0]}/{gear[1]} must be positive"
+        )
+    shaft_revolutions = revolutions / counts * gear[1] / gear[0]
+    if kind == "rotary":
+        return 2 * pi * shaft_revolutions
+    if feed is None or feed <= 0:
+        raise ValueError("a linear axis needs `feed` in the machine profile, metres a revolution")
+    return feed * shaft_revolutions
+
+
+_ON_LINEAR_AXES = {
+    "N m s/rad": "N s/m",
+    "N m/rad": "N/m",
+    "N m": "N",
+    "kg m2": "kg",
+    "rad": "m",
+    "rad/s": "m/s",
+}
+
+
+def unit_on(kind: Kind, rotary_unit: str) -> str:
+    """Return how a unit that profiles give for rotary axes is written on an axis of this kind."""
+    return rotary_unit if kind == "rotary" else _ON_LINEAR_AXES.get(rotary_unit, rotary_unit)

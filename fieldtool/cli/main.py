@@ -1,0 +1,383 @@
+"""Commands and exit codes.
+
+0 done; 2 wrong use or profile; 3 refused before motion; 4 stopped for safety; 5 data not good enough
+to identify; 6 write-back failed and was restored; 7 write-back failed and could not be restored; 130
+stopped by the user, machine safe.
+"""
+
+import json
+import signal
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from datetime import datetime
+from pathlib import Path
+from types import FrameType
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+
+from drives.errors import (
+    BusError,
+    DrivesError,
+    NothingMovedError,
+    ProfileError,
+    SafetyStopError,
+    SdoError,
+    UserStopError,
+    WriteBackError,
+    WriteBackMixedError,
+)
+from drives.parameters import Change
+from fieldtool import workflow
+from fieldtool.cli.screen import TerminalScreen, model_table, parameter_rows, show_result
+from fieldtool.errors import (
+    FieldtoolError,
+    FileFormatError,
+    IdentificationError,
+    OutputError,
+    PlanRefusedError,
+)
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    help="Commissioning of elastic multi-axis machines over CANopen drives.",
+)
+
+EXIT_CODES: tuple[tuple[type[Exception], int], ...] = (
+    (UserStopError, 130),
+    (WriteBackMixedError, 7),
+    (WriteBackError, 6),
+    (SafetyStopError, 4),
+    (IdentificationError, 5),
+    (ProfileError, 2),
+    (FileFormatError, 2),
+    (PlanRefusedError, 3),
+    (OutputError, 3),
+    (NothingMovedError, 3),
+    (BusError, 3),
+    (SdoError, 3),
+    (FieldtoolError, 3),
+    (DrivesError, 3),
+)
+
+Machine = Annotated[str, typer.Argument(help="Name of a machine profile, or path of its file.")]
+Out = Annotated[
+    Path | None, typer.Option("--out", help="Session folder; a new one in sessions/ otherwise.")
+]
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")]
+Yes = Annotated[bool, typer.Option("--yes", help="Do not ask before writing.")]
+Store = Annotated[
+    bool, typer.Option("--store", help="Keep the new parameters in non-volatile memory too.")
+]
+Plan = Annotated[str, typer.Option("--plan", help="How to measure: classic.")]
+Motor = Annotated[
+    str,
+    typer.Option(
+        "--motor-inertia",
+        help="measured: from the high-frequency gain; data-sheet: from the machine profile.",
+    ),
+]
+
+
+class _StopKey:
+    """Ctrl-C asks for a stop; the motion ends in its next cycle and leaves the machine safe."""
+
+    def __init__(self) -> None:
+        self.pressed = False
+
+    def __call__(self) -> bool:
+        return self.pressed
+
+    def on_signal(self, _number: int, _frame: FrameType | None) -> None:
+        if self.pressed:
+            return
+        self.pressed = True
+        sys.stderr.write("\nStopping all axes ...\n")
+
+
+@contextmanager
+def _stop_key() -> Iterator[_StopKey]:
+    key = _StopKey()
+    before = signal.signal(signal.SIGINT, key.on_signal)
+    before_term = signal.signal(signal.SIGTERM, key.on_signal)
+    try:
+        yield key
+    finally:
+        signal.signal(signal.SIGINT, before)
+        signal.signal(signal.SIGTERM, before_term)
+
+
+def _console(as_json: bool) -> Console:
+    return Console(stderr=as_json, highlight=False, soft_wrap=False)
+
+
+def _folder(out: Path | None, name: str) -> Path:
+    if out is not None:
+        return out
+    return Path("sessions") / f"{Path(name).stem}-{datetime.now():%Y%m%d-%H%M%S}"
+
+
+def _options(plan: str, write: bool, store: bool, motor: str) -> workflow.Options:
+    if plan != "classic":
+        raise typer.BadParameter(f"no plan is called {plan!r}; there is: classic")
+    if motor not in ("measured", "data-sheet"):
+        raise typer.BadParameter(f"--motor-inertia is measured or data-sheet, got {motor!r}")
+    return workflow.Options(
+        plan="classic",
+        write=write,
+        store=store,
+        motor_inertia="measured" if motor == "measured" else "data sheet",
+    )
+
+
+def _asker(console: Console, yes: bool) -> Callable[[Sequence[Change]], bool]:
+    def ask(changes: Sequence[Change]) -> bool:
+        rows = [
+            {
+                "axis": c.axis,
+                "name": c.name,
+                "unit": c.unit,
+                "before": c.before,
+                "after": c.after,
+                "read_back": None,
+            }
+            for c in changes
+        ]
+        raw: Mapping[Any, Any] = {(c.axis, c.name): (c.before_raw, c.after_raw) for c in changes}
+        console.print(parameter_rows(rows, raw))
+        if yes:
+            return True
+        if not sys.stdin.isatty():
+            console.print(
+                "  Not written: there is nobody to ask. Use --yes to write without asking."
+            )
+            return False
+        return typer.confirm("Write these parameters into the drives?", err=True)
+
+    return ask
+
+
+def _print_json(data: Mapping[str, Any]) -> None:
+    sys.stdout.write(json.dumps(data, indent=2, allow_nan=False) + "\n")
+
+
+@app.command()
+def run(
+    machine: Machine,
+    plan: Plan = "classic",
+    write: Annotated[bool, typer.Option("--write/--no-write")] = False,
+    yes: Yes = False,
+    store: Store = False,
+    motor_inertia: Motor = "measured",
+    out: Out = None,
+    as_json: Json = False,
+) -> None:
+    """Measure, identify, design and, with --write, write back: all stages in order."""
+    options = _options(plan, write, store, motor_inertia)
+    console = _console(as_json)
+    with _stop_key() as key, TerminalScreen(console) as screen:
+        result = workflow.run(
+            machine,
+            _folder(out, machine),
+            options,
+            screen=screen,
+            confirm=_asker(console, yes),
+            stop_requested=key,
+        )
+    show_result(console, result)
+    if as_json:
+        _print_json(result.as_dict())
+
+
+@app.command()
+def demo(
+    plan: Plan = "classic",
+    write: Annotated[bool, typer.Option("--write/--no-write")] = True,
+    store: Store = False,
+    machine: Annotated[
+        str, typer.Option("--machine", help="Another packaged simulated machine.")
+    ] = "paper-3x3",
+    out: Out = None,
+    as_json: Json = False,
+) -> None:
+    """Do the whole job on the packaged simulated machine: no hardware, no arguments."""
+    run(machine, plan, write, True, store, "measured", out, as_json)
+
+
+@app.command()
+def measure(
+    machine: Machine, plan: Plan = "classic", out: Out = None, as_json: Json = False
+) -> None:
+    """Measure only; the recording is in the session folder."""
+    _options(plan, False, False, "measured")
+    console = _console(as_json)
+    folder = _folder(out, machine)
+    with _stop_key() as key, TerminalScreen(console) as screen:
+        seconds = workflow.measure(machine, folder, screen=screen, stop_requested=key)
+    console.print(f"{seconds:.0f} s of machine time; the recording is in {folder}")
+    if as_json:
+        _print_json({"folder": str(folder), "time": {"machine_s": seconds}})
+
+
+@app.command()
+def identify(
+    source: Annotated[Path, typer.Argument(help="Session folder, or recording (FILE.h5).")],
+    masses: Annotated[
+        list[str] | None, typer.Option("--masses", help="Chain length, as AXIS=N; may be repeated.")
+    ] = None,
+    motor_inertia: Motor = "measured",
+    as_json: Json = False,
+) -> None:
+    """Identify masses, springs, couplings and dampers from a recording."""
+    console = _console(as_json)
+    options = _options("classic", False, False, motor_inertia)
+    found = workflow.identify(source, options, _lengths(masses or []))
+    console.print(model_table(found.model, None))
+    if found.chain is not None:
+        for line in found.chain.sentences:
+            console.print(f"  {line}")
+    for note in found.notes:
+        console.print(f"  {note}")
+    if as_json:
+        _print_json({"model": found.model.as_dict(), "notes": list(found.notes)})
+
+
+@app.command()
+def compare(
+    recording: Annotated[Path, typer.Argument(help="Recording (FILE.h5) with a load-side signal.")],
+    model: Annotated[
+        Path | None, typer.Option("--model", help="model.yaml; identified otherwise.")
+    ] = None,
+    low: Annotated[float, typer.Option(help="Hz")] = 11.0,
+    high: Annotated[float, typer.Option(help="Hz")] = 200.0,
+    as_json: Json = False,
+) -> None:
+    """Predict a signal that no fit has seen (the load side), and print the error."""
+    console = _console(as_json)
+    comparisons = workflow.compare(recording, model, (low, high))
+    for c in comparisons:
+        console.print(
+            f"{c.experiment}: load-side response, {c.frequencies.size} lines from {low:g} to {high:g} "
+            f"Hz, never used in the fit: median error {c.median_db:.2f} dB and "
+            f"{c.median_degrees:.2f} degrees."
+        )
+    if as_json:
+        _print_json(
+            {
+                "comparisons": [
+                    {
+                        "experiment": c.experiment,
+                        "lines": int(c.frequencies.size),
+                        "median_db": c.median_db,
+                        "median_degrees": c.median_degrees,
+                    }
+                    for c in comparisons
+                ]
+            }
+        )
+
+
+@app.command()
+def design(folder: Annotated[Path, typer.Argument(help="Session folder.")]) -> None:
+    """Design controller parameters from the session folder's model."""
+    tuning = workflow.redesign(folder)
+    console = _console(False)
+    for axis in tuning.axes:
+        console.print(
+            f"{axis.axis}: {axis.reason} Peak of sensitivity {axis.sensitivity_peak:.2f}."
+        )
+
+
+@app.command()
+def write(
+    folder: Annotated[Path, typer.Argument(help="Session folder with a tuning.")],
+    yes: Yes = False,
+    store: Store = False,
+) -> None:
+    """Write the session folder's tuning into the drives: backup, write, read back."""
+    console = _console(False)
+    options = workflow.Options(write=True, store=store)
+    with TerminalScreen(console) as screen:
+        workflow.write(folder, options, _asker(console, yes), screen=screen)
+
+
+@app.command()
+def restore(
+    backup: Annotated[Path, typer.Argument(help="Backup file, or the session folder with it.")],
+    machine: Annotated[
+        str | None, typer.Option("--machine", help="Machine profile; the session's otherwise.")
+    ] = None,
+    store: Store = False,
+) -> None:
+    """Bring a backup of the drives' parameters back."""
+    if machine is None:
+        folder = backup if backup.is_dir() else backup.parent
+        machine = str(folder / "machine.yaml")
+    written = workflow.restore(machine, backup, store)
+    console = _console(False)
+    console.print(f"{len(written)} parameters differed and were restored; all were read back.")
+
+
+@app.command("import")
+def import_(
+    folder: Annotated[Path, typer.Argument(help="Folder with recording.yaml and CSV files.")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="Recording to write (FILE.h5).")],
+) -> None:
+    """Turn a folder with recording.yaml and CSV files into a recording."""
+    recording = workflow.import_folder(folder, out)
+    rows = sum(e.samples for e in recording.experiments)
+    _console(False).print(f"{out}: {len(recording.experiments)} experiments, {rows} rows.")
+
+
+@app.command()
+def export(
+    recording: Annotated[Path, typer.Argument(help="Recording (FILE.h5).")],
+    folder: Annotated[Path, typer.Argument(help="Folder to write.")],
+) -> None:
+    """Turn a recording into a folder with recording.yaml and CSV files."""
+    workflow.export_folder(recording, folder)
+    _console(False).print(f"{folder} written.")
+
+
+@app.command()
+def simulate(
+    machine: Machine,
+    interface: Annotated[str, typer.Option(help="python-can interface.")],
+    channel: Annotated[str, typer.Option(help="Its channel.")],
+) -> None:
+    """Serve the simulated machine's nodes in real time on a bus, until Ctrl-C."""
+    console = _console(False)
+    with _stop_key() as key:
+        console.print(f"Serving {machine} on {interface} {channel}; Ctrl-C ends it.")
+        workflow.simulate(machine, interface, channel, key)
+
+
+def _lengths(masses: Sequence[str]) -> dict[str, int]:
+    lengths = {}
+    for text in masses:
+        name, equals, count = text.partition("=")
+        if not equals or not count.isdigit() or not 1 <= int(count) <= 16:
+            raise typer.BadParameter(f"--masses takes AXIS=N with N from 1 to 16, got {text!r}")
+        lengths[name] = int(count)
+    return lengths
+
+
+def exit_code(error: BaseException) -> int:
+    """Return the exit code of an error."""
+    return next((code for kind, code in EXIT_CODES if isinstance(error, kind)), 1)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run a command; errors become one sentence on standard error and an exit code."""
+    try:
+        app(args=None if arguments is None else list(arguments))
+    except (FieldtoolError, DrivesError) as error:
+        sys.stderr.write(f"fieldtool: {error}\n")
+        sys.exit(exit_code(error))
+    except KeyboardInterrupt:
+        sys.stderr.write("fieldtool: stopped by the user\n")
+        sys.exit(130)

@@ -1,0 +1,251 @@
+"""What a session looks like on a terminal: where it is, how long it will take, what it found."""
+
+from collections.abc import Mapping, Sequence
+from time import perf_counter
+from types import TracebackType
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, ProgressColumn, Task, TextColumn
+from rich.progress import Progress as Bar
+from rich.table import Table
+from rich.text import Text
+
+from fieldtool.experiment.forecast import AxisForecast
+from fieldtool.experiment.plan import SweepPlan
+from fieldtool.experiment.runner import Progress
+from fieldtool.records.model import Estimate, MachineModel
+from fieldtool.workflow import SessionResult
+
+UNITS = {
+    "rotary": {"mass": "kg m2", "spring": "N m/rad", "damper": "N m s/rad", "position": "rad"},
+    "linear": {"mass": "kg", "spring": "N/m", "damper": "N s/m", "position": "m"},
+}
+
+
+class _Left(ProgressColumn):
+    """Time left, from the pace so far; it stays on the screen from the first tone on."""
+
+    def render(self, task: Task) -> Text:
+        """Return e.g. ``about 1:20 left``."""
+        if task.finished:
+            return Text(f"{_clock(task.elapsed or 0)} taken")
+        if not task.completed or not task.elapsed:
+            return Text("time left: measuring the pace")
+        left = task.elapsed * (1 - task.completed) / task.completed
+        return Text(f"about {_clock(left)} left")
+
+
+class TerminalScreen:
+    """Shows a session with ``rich``; a context manager, so that the terminal is left in order."""
+
+    def __init__(self, console: Console) -> None:
+        self.console = console
+        self._bar: Bar | None = None
+        self._task: Any = None
+        self._last_shown = 0.0
+
+    def __enter__(self) -> "TerminalScreen":
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._close()
+
+    def stage(self, title: str) -> None:
+        """Show the title of a new stage."""
+        self._close()
+        self.console.print(f"[bold]▶ {title}[/bold]")
+
+    def say(self, sentence: str) -> None:
+        """Show a sentence."""
+        console = self._bar.console if self._bar else self.console
+        console.print(Text("  " + sentence), style="yellow" if "!" in sentence else "")
+
+    def plan(self, plan: SweepPlan, expected: Sequence[AxisForecast], duration: float) -> None:
+        """Show what will move, how far, and for how long."""
+        sweeps = Table(title=None, box=None, padding=(0, 2))
+        for title in ("axis moved", "how", "others floating", "tones", "Hz"):
+            sweeps.add_column(title, style="cyan" if title == "axis moved" else "")
+        for sweep in plan.sweeps:
+            tones = [tone.frequency for tone in sweep.tones]
+            sweeps.add_row(
+                sweep.driven,
+                sweep.kind,
+                ", ".join(sweep.free) or "none, all held",
+                str(len(tones)),
+                f"{min(tones):.2f} - {max(tones):.2f}",
+            )
+        self.console.print(sweeps)
+        peaks = Table(box=None, padding=(0, 2))
+        for title in ("axis", "moves at most", "speed", "torque", "following error"):
+            peaks.add_column(title)
+        for axis in expected:
+            peaks.add_row(
+                axis.axis,
+                f"±{axis.excursion:.3g}",
+                f"{axis.velocity:.3g}/s",
+                f"{axis.torque:.3g}",
+                f"{axis.following_error:.3g}",
+            )
+        self.console.print(peaks)
+        self.console.print(
+            f"  Simulated with the prior model: every limit is kept. About {_clock(duration)} of "
+            f"machine time, a cycle of {plan.cycle_time * 1000:g} ms."
+        )
+
+    def progress(self, progress: Progress) -> None:
+        """Move the bar."""
+        if self._bar is None:
+            self._bar = Bar(
+                TextColumn("  {task.description}"),
+                BarColumn(bar_width=24),
+                TextColumn("{task.percentage:>3.0f} %"),
+                _Left(),
+                console=self.console,
+                transient=True,
+                refresh_per_second=4,
+            )
+            self._bar.start()
+            self._task = self._bar.add_task("", total=1.0)
+        self._bar.update(
+            self._task,
+            completed=progress.done,
+            description=(
+                f"sweep {progress.sweep}/{progress.sweeps}: {progress.name}, "
+                f"{progress.frequency:.2f} Hz, ±{progress.amplitude:.2g}; "
+                f"machine time {_clock(progress.machine_time)}"
+            ),
+        )
+        if not self.console.is_terminal and perf_counter() - self._last_shown > 10:
+            self._last_shown = perf_counter()
+            task = self._bar.tasks[0]
+            self.console.print(
+                f"  {100 * progress.done:.0f} %, {task.description}, {_Left().render(task)}"
+            )
+
+    def _close(self) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+            self._bar = None
+
+
+def _clock(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes}:{rest:02d} min"
+
+
+def model_table(model: MachineModel, truth: MachineModel | None) -> Table:
+    """Return masses, springs, dampers and couplings with their 95 % intervals."""
+    table = Table(box=None, padding=(0, 2))
+    for title in ("axis", "what", "value", "± (95 %)", "unit"):
+        table.add_column(title, justify="left" if title in ("axis", "what", "unit") else "right")
+    if truth is not None:
+        table.add_column("simulated truth", justify="right")
+        table.add_column("error", justify="right")
+    for k, axis in enumerate(model.axes):
+        true_axis = truth.axes[k] if truth else None
+        for what, values in (
+            ("mass", axis.masses),
+            ("spring", axis.springs),
+            ("damper", axis.dampers),
+        ):
+            known: Sequence[Estimate | None] = (
+                getattr(true_axis, what + "s") if true_axis else [None] * len(values)
+            )
+            for j, (value, true) in enumerate(zip(values, known, strict=False)):
+                _row(
+                    table, axis.name, f"{what} {j + 1}", value, UNITS[axis.kind][what], true, truth
+                )
+    true_couplings: Mapping[tuple[str, ...], float] = (
+        {tuple(sorted(c.axes)): c.value for c in truth.couplings} if truth else {}
+    )
+    for c in model.couplings:
+        true_value = true_couplings.get(tuple(sorted(c.axes)), 0.0) if truth else None
+        _row(
+            table,
+            " - ".join(c.axes),
+            "coupling",
+            Estimate(c.value, c.std),
+            UNITS[model.axes[0].kind]["mass"],
+            Estimate(true_value) if true_value is not None else None,
+            truth,
+        )
+    return table
+
+
+def _row(
+    table: Table,
+    axis: str,
+    what: str,
+    value: Estimate,
+    unit: str,
+    true: Estimate | None,
+    truth: MachineModel | None,
+) -> None:
+    interval = f"{1.96 * value.std:.2g}" if value.std == value.std else "not known"
+    cells = [axis, what, f"{value.value:.5g}", interval, unit]
+    if truth is not None and true is not None:
+        error = f"{100 * (value.value / true.value - 1):+.2f} %" if true.value else ""
+        cells += [f"{true.value:g}", error]
+    table.add_row(*cells)
+
+
+def parameter_rows(rows: Sequence[Mapping[str, Any]], drive_units: Mapping[Any, Any]) -> Table:
+    """Return old and new parameters in physical and in drive units, and what was read back."""
+    table = Table(box=None, padding=(0, 2))
+    for title in (
+        "axis",
+        "parameter",
+        "old",
+        "new",
+        "unit",
+        "old (drive)",
+        "new (drive)",
+        "read back",
+    ):
+        table.add_column(
+            title, justify="left" if title in ("axis", "parameter", "unit") else "right"
+        )
+    for row in rows:
+        raw = drive_units.get((row["axis"], row["name"]), ("", ""))
+        same = row["before"] == row["after"]
+        table.add_row(
+            row["axis"],
+            row["name"],
+            f"{row['before']:.6g}",
+            f"{row['after']:.6g}",
+            row["unit"] if row["unit"] != "1" else "",
+            _plain(raw[0]),
+            _plain(raw[1]),
+            "" if row["read_back"] is None else f"{row['read_back']:.6g}",
+            style="dim" if same else "",
+        )
+    return table
+
+
+def _plain(value: object) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def show_result(console: Console, result: SessionResult) -> None:
+    """Show what a session found and did."""
+    console.print("\n[bold]The machine[/bold]")
+    console.print(model_table(result.model, result.truth))
+    if result.write_back is not None:
+        console.print("\n[bold]Controller parameters[/bold]")
+        from fieldtool.workflow import parameter_table
+
+        raw = {(c.axis, c.name): (c.before_raw, c.after_raw) for c in result.write_back.changes}
+        console.print(parameter_rows(parameter_table(result.write_back), raw))
+        for axis in result.tuning.axes:
+            console.print(f"  {axis.axis}: {axis.reason}")
+        console.print(f"  {result.write_back.sentence}")
+    console.print(
+        f"\nMachine time {_clock(result.machine_time)}, wall time {_clock(result.wall_time)}. "
+        f"Everything is in {result.folder}"
+    )

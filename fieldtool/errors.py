@@ -1,0 +1,50 @@
+"""What can go wrong in the tool, as a tree; what drives do wrong stands in ``drives.errors``.
+
+::
+
+    FieldtoolError
+    ├── FileFormatError          a file is not what it should be (file, line, column, what to do)
+    ├── OutputError              a folder or file can not be written
+    ├── PlanRefusedError         the experiment would leave a limit, or nothing safe is possible
+    └── IdentificationError      the data do not allow the answer
+        ├── NotAChainError       the modes can not come from chains driven at their ends
+        └── NotEnoughDataError   too few lines, too much noise, nothing moved
+"""
+
+from pathlib import Path
+
+
+class FieldtoolError(Exception):
+    """Root of all that the tool itself refuses; its message is one sentence for a person."""
+
+
+class FileFormatError(FieldtoolError):
+    """A file is not what it should be.
+
+    Scenarios: a missing column, text where a number belongs, a wrong sample period, an unknown key.
+    """
+
+    def __init__(self, path: Path | str, message: str, line: int | None = None) -> None:
+        self.path, self.line = Path(path), line
+        where = f"{path}:{line}" if line is not None else f"{path}"
+        super().__init__(f"{where}: {message}")
+
+
+class OutputError(FieldtoolError):
+    """A result can not be written: disk full, no such folder, no permission."""
+
+
+class PlanRefusedError(FieldtoolError):
+    """The experiment was refused before anything moved."""
+
+
+class IdentificationError(FieldtoolError):
+    """The data do not allow the answer that was asked for."""
+
+
+class NotAChainError(IdentificationError):
+    """The modes can not come from chains of masses and springs driven at their ends."""
+
+
+class NotEnoughDataError(IdentificationError):
+    """Too few frequencies, too much noise, or nothing moved."""

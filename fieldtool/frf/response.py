@@ -1,0 +1,135 @@
+"""The frequency response of a machine as a value, and its file ``frequency-response.h5``.
+
+Layout of the file (HDF5, format ``fieldtool-frequency-response/1``): group ``responses`` with one
+group ``0000``, ... per response: attributes ``name``, ``condition``, ``axes``; datasets
+``frequencies`` (F,), ``response`` (F, M, M) as pairs r, i, and ``std`` (F, M, M).
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from fieldtool.errors import FileFormatError
+from fieldtool.records.hdf5_file import MemoryFile, Reader, opened, put
+
+FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+FORMAT = "fieldtool-frequency-response/1"
+
+
+@dataclass(frozen=True, eq=False)
+class FrequencyResponse:
+    """Position of axis i per torque of axis j of M axes at F frequencies; NaN = not measured."""
+
+    axes: tuple[str, ...]
+    frequencies: FloatArray
+    """(F,), Hz, rising."""
+    response: ComplexArray
+    """(F, M, M), rad/(N m) or m/N (or per A); [f, i, j] is position i per torque j."""
+    std: FloatArray
+    """(F, M, M): standard error of the real part, and of the imaginary part."""
+    condition: str
+    """What the axes that were not driven did: ``others free``, ``others locked``, ..."""
+
+    def __post_init__(self) -> None:
+        F, M = self.frequencies.size, len(self.axes)
+        if self.frequencies.shape != (F,) or M == 0:
+            raise ValueError(f"frequencies must be (F,) and axes named, got {F} and {self.axes}")
+        if not np.all(np.isfinite(self.frequencies)) or np.any(self.frequencies <= 0):
+            raise ValueError("frequencies must be finite and above 0 Hz")
+        if np.any(np.diff(self.frequencies) <= 0):
+            raise ValueError("frequencies must rise, each there once")
+        for name, values in (("response", self.response), ("std", self.std)):
+            if values.shape != (F, M, M):
+                raise ValueError(f"{name} must have shape {(F, M, M)}, got {values.shape}")
+            if np.any(np.isinf(values)):
+                raise ValueError(f"{name} must not be infinite")
+        if not np.array_equal(np.isnan(self.response), np.isnan(self.std)):
+            raise ValueError("response and std must be NaN at the same places")
+        if np.any(self.std < 0):
+            raise ValueError("std must not be negative")
+
+    @property
+    def measured(self) -> NDArray[np.bool_]:
+        """Where there is a value, (F, M, M)."""
+        return ~np.isnan(self.response)
+
+    @property
+    def complex_std(self) -> FloatArray:
+        """Square root of E|error|^2 of the complex value, (F, M, M): sqrt(2) times ``std``."""
+        scaled: FloatArray = np.sqrt(2.0) * self.std
+        return scaled
+
+    def element(
+        self, position: str | int, torque: str | int
+    ) -> tuple[FloatArray, ComplexArray, FloatArray]:
+        """Return frequencies, response and std of one element where it was measured, (f,) each."""
+        i, j = self.index(position), self.index(torque)
+        there = self.measured[:, i, j]
+        return self.frequencies[there], self.response[there, i, j], self.std[there, i, j]
+
+    def index(self, axis: str | int) -> int:
+        """Return the place of an axis; KeyError if there is none of that name."""
+        if isinstance(axis, str):
+            if axis not in self.axes:
+                raise KeyError(f"no axis '{axis}' among {', '.join(self.axes)}")
+            return self.axes.index(axis)
+        return range(len(self.axes))[axis]
+
+
+def save_responses(responses: Mapping[str, FrequencyResponse], path: Path | str) -> None:
+    """Write named responses to one file, in one step.
+
+    Raises
+    ------
+    OutputError
+        If the file can not be written.
+    """
+    file = MemoryFile(FORMAT)
+    try:
+        root = file.root.create_group("responses")
+        for index, (name, response) in enumerate(responses.items()):
+            group = root.create_group(f"{index:04d}")
+            group.attrs["name"] = name
+            group.attrs["condition"] = response.condition
+            axes = np.array(response.axes, dtype=object)
+            group.attrs.create("axes", axes, dtype=h5py.string_dtype())
+            put(group, "frequencies", response.frequencies)
+            put(group, "response", response.response)
+            put(group, "std", response.std)
+        file.write(path)
+    finally:
+        file.close()
+
+
+def load_responses(path: Path | str) -> dict[str, FrequencyResponse]:
+    """Return the named responses in the file ``path``, in the order they were saved in.
+
+    Raises
+    ------
+    FileFormatError
+        If it is missing, no HDF5 file, of another format, damaged, or contradicts itself.
+    """
+    with opened(path, FORMAT) as reader:
+        try:
+            found = [_read(group) for group in reader.child("responses").children()]
+        except ValueError as error:
+            raise FileFormatError(path, f"does not hold a valid response: {error}.") from error
+        except (OSError, RuntimeError) as error:
+            raise FileFormatError(path, f"is damaged ({error}).") from error
+    return dict(found)
+
+
+def _read(reader: Reader) -> tuple[str, FrequencyResponse]:
+    response = FrequencyResponse(
+        axes=reader.texts("axes"),
+        frequencies=reader.array("frequencies", np.float64, 1),
+        response=reader.array("response", np.complex128, 3),
+        std=reader.array("std", np.float64, 3),
+        condition=reader.text("condition"),
+    )
+    return reader.text("name"), response

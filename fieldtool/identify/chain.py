@@ -1,0 +1,197 @@
+"""One elastic axis from periodic data: masses, springs, dampers, delay and friction.
+
+Start values come from a fit of modes and order reduction; then maximum likelihood.  Where the
+misfit is more than noise explains, the model's own error is taken as a constant share of the
+response, the share that makes the misfit what it should be, so that neither the strong lines nor
+the weak ones decide alone, and the standard errors are honest.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import eig, eigh
+
+from fieldtool.errors import NotEnoughDataError
+from fieldtool.frf.matrix import column_responses
+from fieldtool.frf.multisine import analyse_multisine
+from fieldtool.frf.response import FrequencyResponse
+from fieldtool.identify.modal_chain import reduce_modes
+from fieldtool.identify.modes import fit_modes
+from fieldtool.identify.refine import RefinedModel, refine
+from fieldtool.identify.response_data import ResponseMatrix
+from fieldtool.records.model import Estimate, FloatArray, MachineModel
+from fieldtool.records.recording import Recording
+
+SHARES = (0.0, 0.003, 0.01, 0.02, 0.03, 0.05, 0.1)
+"""Of the response: model errors to try, the smallest that explains the misfit is taken."""
+STEP = 1e-5
+"""Relative step of the features' derivatives."""
+
+
+@dataclass(frozen=True, eq=False)
+class ChainResult:
+    """One elastic axis."""
+
+    model: MachineModel
+    delay: Estimate
+    """From torque to position, s."""
+    resonances: tuple[Estimate, ...]
+    """Hz, undamped, rising."""
+    antiresonances: tuple[Estimate, ...]
+    """Hz, undamped, rising."""
+    damping_ratios: tuple[Estimate, ...]
+    """Of the resonances."""
+    inertia_ratio: Estimate
+    """Last mass over first mass."""
+    model_error: float
+    """Share of the response that the model can not explain."""
+    response: FrequencyResponse
+    notes: tuple[str, ...]
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """The features, one sentence each, with standard errors."""
+        lines = [f"inertia ratio load / motor {_shown(self.inertia_ratio)}"]
+        for name, values, unit in (
+            ("antiresonance", self.antiresonances, " Hz"),
+            ("resonance", self.resonances, " Hz"),
+            ("damping ratio of the resonance", self.damping_ratios, ""),
+        ):
+            lines += [f"{name} {_shown(value)}{unit}" for value in values]
+        delay = Estimate(1e3 * self.delay.value, 1e3 * self.delay.std)
+        return (*lines, f"delay from torque to position {_shown(delay)} ms")
+
+
+def identify_chain(recording: Recording, masses: int) -> ChainResult:
+    """Identify the only axis of a recording from its multisine experiments.
+
+    Parameters
+    ----------
+    recording
+        One axis; at least one experiment with a ``period``.
+    masses
+        Length of its chain.
+
+    Raises
+    ------
+    NotEnoughDataError
+        If there is no periodic experiment, or too few excited lines.
+    IdentificationError
+        If the response can not come from such a chain.
+    """
+    periodic = [e for e in recording.experiments if e.kind == "multisine" and e.period]
+    if not periodic or len(recording.axes) != 1:
+        raise NotEnoughDataError(
+            "a multisine of a single axis with its `period` is needed; the recording has "
+            f"{len(recording.axes)} axes and {len(periodic)} periodic experiments."
+        )
+    phasors = [analyse_multisine(recording, e).phasors for e in periodic]
+    response = next(iter(column_responses(phasors).values()))
+    start = _start(response, masses, recording)
+    share, fitted = _fitted(response, start)
+    notes = [u.reason for u in fitted.unknown]
+    if share >= 0.01:
+        notes.append(
+            f"{100 * share:.2g} % of the response is not explained by masses, springs, dampers, delay "
+            "and viscous friction; noise is far below that."
+        )
+    features = _Features(fitted)
+    return ChainResult(
+        model=fitted.model,
+        delay=fitted.delays[0],
+        resonances=features.estimates(_resonances),
+        antiresonances=features.estimates(_antiresonances),
+        damping_ratios=features.estimates(_damping_ratios),
+        inertia_ratio=features.estimates(_inertia_ratio)[0],
+        model_error=share,
+        response=response,
+        notes=tuple(notes),
+    )
+
+
+def _matrix(response: FrequencyResponse, share: float) -> ResponseMatrix:
+    std = np.hypot(response.complex_std, share * np.abs(response.response))
+    return ResponseMatrix(response.axes, 2 * np.pi * response.frequencies, response.response, std)
+
+
+def _start(response: FrequencyResponse, masses: int, recording: Recording) -> MachineModel:
+    modal = fit_modes(_matrix(response, SHARES[-1]), masses - 1, fit_friction=True, fit_delay=True)
+    name, kind = response.axes[0], recording.axes[0].kind
+    return reduce_modes(modal, {name: masses}, {name: kind}).model
+
+
+def _fitted(response: FrequencyResponse, start: MachineModel) -> tuple[float, RefinedModel]:
+    """Return the smallest model error that explains the misfit, and the fit with it."""
+    best: tuple[float, RefinedModel] | None = None
+    for share in SHARES:
+        found = refine(start, _matrix(response, share), fit_delay=True, fit_friction=True)
+        best = (share, found)
+        start = replace(found.model)
+        if found.chi2 <= found.degrees_of_freedom:
+            break
+    if best is None:
+        raise NotEnoughDataError("nothing was fitted")
+    return best
+
+
+class _Features:
+    """Values that follow from the fitted parameters, with errors by linear propagation."""
+
+    def __init__(self, fitted: RefinedModel) -> None:
+        self._fitted = fitted
+
+    def estimates(self, feature: Callable[[MachineModel], FloatArray]) -> tuple[Estimate, ...]:
+        fitted = self._fitted
+        values = feature(fitted.model)
+        jacobian = np.zeros((values.size, fitted.values.size))
+        for k, value in enumerate(fitted.values):
+            step = STEP * max(abs(value), 1e-12)
+            above = feature(_moved(fitted, k, step))
+            jacobian[:, k] = (above - values) / step
+        covariance = jacobian @ fitted.covariance @ jacobian.T
+        errors = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+        return tuple(Estimate(float(v), float(e)) for v, e in zip(values, errors, strict=True))
+
+
+def _moved(fitted: RefinedModel, k: int, step: float) -> MachineModel:
+    """Return the fitted machine with one fitted parameter changed."""
+    listed = machine_parameters(fitted.model, np.ones(1))
+    values = parameter_values(fitted.model, listed, [d.value for d in fitted.delays])
+    place = next(i for i, p in enumerate(listed) if p.name == fitted.names[k])
+    values[place] += step
+    return with_values(fitted.model, listed, values)[0]
+
+
+def _shown(value: Estimate) -> str:
+    digits = max(0, 1 - int(np.floor(np.log10(value.std)))) if value.std > 0 else 4
+    return f"{value.value:.{digits}f} ± {value.std:.{digits}f}"
+
+
+def _resonances(model: MachineModel) -> FloatArray:
+    values = eigh(model.stiffness_matrix, model.mass_matrix, eigvals_only=True)
+    result: FloatArray = np.sqrt(np.abs(values[1:])) / (2 * np.pi)
+    return result
+
+
+def _antiresonances(model: MachineModel) -> FloatArray:
+    values = eigh(model.stiffness_matrix[1:, 1:], model.mass_matrix[1:, 1:], eigvals_only=True)
+    result: FloatArray = np.sqrt(values) / (2 * np.pi)
+    return result
+
+
+def _damping_ratios(model: MachineModel) -> FloatArray:
+    mass, n = model.mass_matrix, model.mass_matrix.shape[0]
+    zero, one = np.zeros((n, n)), np.eye(n)
+    a = np.block([[zero, one], [-model.stiffness_matrix, -model.damping_matrix]])
+    b = np.block([[one, zero], [zero, mass]])
+    poles = eig(a, b, right=False)
+    upper = poles[poles.imag > 1e-6 * np.abs(poles).max()]
+    upper = upper[np.argsort(np.abs(upper))]
+    result: FloatArray = -upper.real / np.abs(upper)
+    return result
+
+
+def _inertia_ratio(model: MachineModel) -> FloatArray:
+    masses = model.axes[0].masses
+    return np.array([masses[-1].value / masses[0].value])

@@ -1,0 +1,147 @@
+"""HDF5 files: written in memory and renamed into place whole, read with clear errors."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from fieldtool.errors import FileFormatError
+from fieldtool.records.files import check_size, write_atomic
+
+MAX_BYTES = 16 * 1024**3
+MAX_VALUES = 500_000_000
+"""Most values in one dataset that are read: 4 GB of float64."""
+
+
+class MemoryFile:
+    """An HDF5 file in memory; :meth:`write` puts a whole, valid copy of it on the disk.
+
+    The file on the disk is replaced in one step, so it is valid at any moment, also when the
+    program or the power goes.  It costs one copy of the (compressed) file in memory.
+    """
+
+    def __init__(self, file_format: str) -> None:
+        self.root = h5py.File("in-memory.h5", "w", driver="core", backing_store=False)
+        self.root.attrs["format"] = file_format
+
+    def write(self, path: Path | str) -> None:
+        """Replace ``path`` by the present content; raise OutputError if that is not possible."""
+        self.root.flush()
+        write_atomic(path, self.root.id.get_file_image())
+
+    def close(self) -> None:
+        """Forget the content; calling it twice does no harm."""
+        self.root.close()
+
+
+def put(group: Any, name: str, values: NDArray[Any]) -> None:
+    """Store an array, compressed without loss."""
+    packed = {"compression": "gzip", "compression_opts": 4, "shuffle": True} if values.size else {}
+    group.create_dataset(name, data=values, **packed)
+
+
+class Reader:
+    """One group of an HDF5 file; whatever is missing or of a wrong type names file and place."""
+
+    def __init__(self, path: Path, group: Any) -> None:
+        self.path, self.group = path, group
+
+    def fault(self, message: str) -> FileFormatError:
+        """Return an error about this group."""
+        return FileFormatError(self.path, f"in {self.group.name}: {message}")
+
+    def child(self, name: str) -> "Reader":
+        """Return the group ``name`` inside this one."""
+        found = self.group.get(name)
+        if not isinstance(found, h5py.Group):
+            raise self.fault(f"the group '{name}' is missing; the file is damaged or of another "
+                             "program.")  # fmt: skip
+        return Reader(self.path, found)
+
+    def children(self) -> list["Reader"]:
+        """Return all groups inside this one, by rising name."""
+        return [self.child(name) for name in sorted(self.group)]
+
+    def array(self, name: str, dtype: Any, ndim: int) -> NDArray[Any]:
+        """Return the dataset ``name`` as an array of ``ndim`` dimensions and type ``dtype``."""
+        found = self.group.get(name)
+        if not isinstance(found, h5py.Dataset):
+            raise self.fault(f"the dataset '{name}' is missing; the file is damaged or of another "
+                             "program.")  # fmt: skip
+        if found.ndim != ndim or found.size > MAX_VALUES:
+            raise self.fault(f"the dataset '{name}' has the shape {found.shape}, which is "
+                             f"not {ndim}-dimensional or above {MAX_VALUES} values.")  # fmt: skip
+        if not np.can_cast(found.dtype, dtype, casting="safe"):
+            raise self.fault(f"the dataset '{name}' holds {found.dtype}, expected {dtype}.")
+        try:
+            return np.asarray(found[()], dtype=dtype)
+        except OSError as error:
+            raise self.fault(f"the dataset '{name}' is damaged ({error}).") from error
+
+    def optional_array(self, name: str, dtype: Any, ndim: int) -> NDArray[Any] | None:
+        """Return the dataset ``name``, or None where the file has none."""
+        return self.array(name, dtype, ndim) if name in self.group else None
+
+    def text(self, name: str, default: str | None = None) -> str:
+        """Return the text attribute ``name``."""
+        value = self._attribute(name, default)
+        if not isinstance(value, str):
+            raise self.fault(f"the attribute '{name}' is no text.")
+        return value
+
+    def texts(self, name: str) -> tuple[str, ...]:
+        """Return the attribute ``name``, a list of texts."""
+        value = np.atleast_1d(self._attribute(name))
+        if value.size and not all(isinstance(item, str) for item in value):
+            raise self.fault(f"the attribute '{name}' is no list of texts.")
+        return tuple(str(item) for item in value)
+
+    def number(self, name: str) -> float:
+        """Return the number attribute ``name``."""
+        value: Any = self._attribute(name)
+        if isinstance(value, bool) or not isinstance(value, int | float | np.number):
+            raise self.fault(f"the attribute '{name}' is no number.")
+        return float(value)
+
+    def optional_number(self, name: str) -> float | None:
+        """Return the number attribute ``name``, or None where the file has none."""
+        return self.number(name) if name in self.group.attrs else None
+
+    def _attribute(self, name: str, default: object | None = None) -> Any:
+        value = self.group.attrs.get(name, default)
+        if value is None:
+            raise self.fault(f"the attribute '{name}' is missing; the file is damaged or of "
+                             "another program.")  # fmt: skip
+        return value
+
+
+@contextmanager
+def opened(path: Path | str, file_format: str) -> Iterator[Reader]:
+    """Open ``path`` for reading and check what it says it is.
+
+    Raises
+    ------
+    FileFormatError
+        If it is no HDF5 file or its attribute ``format`` is not ``file_format``.
+    """
+    path = Path(path)
+    check_size(path, MAX_BYTES)
+    try:
+        file = h5py.File(path, "r")
+    except OSError as error:
+        raise FileFormatError(
+            path, f"is not a readable HDF5 file, expected {file_format}."
+        ) from error
+    with file:
+        found = file.attrs.get("format")
+        if found != file_format:
+            raise FileFormatError(
+                path,
+                f"has the format {found!r}, expected '{file_format}': it is of another "
+                "program or of a newer version.",
+            )
+        yield Reader(path, file)

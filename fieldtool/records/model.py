@@ -1,0 +1,252 @@
+"""The elastic model of a machine: chains of masses and springs, coupled at their last masses.
+
+Axis i is a chain that its motor drives at the first mass; inertia couplings m_ab join last masses::
+
+    tau_i -> [ m1 ]--k1--[ m2 ]--k2-- ... --[ mN ]~~ m_ab ~~[ last mass of another chain ]
+
+The equation of motion is M q'' + C q' + K q = tau (paper, equations 1 and 10).  Degrees of freedom
+run chain after chain, motor side first.  SI units: kg, N/m, N s/m on linear axes; kg m2, N m/rad,
+N m s/rad on rotary ones.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from math import nan
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+Kind = Literal["rotary", "linear"]
+FORMAT = "fieldtool-model/1"
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A number and what is known of its error."""
+
+    value: float
+    std: float = nan
+    """Standard error, same unit; NaN where it is not known."""
+
+
+@dataclass(frozen=True)
+class AxisModel:
+    """One chain, motor side first."""
+
+    name: str
+    kind: Kind
+    masses: tuple[Estimate, ...]
+    """N masses, kg or kg m2."""
+    springs: tuple[Estimate, ...]
+    """N - 1 springs, N/m or N m/rad; spring k joins masses k and k + 1."""
+    dampers: tuple[Estimate, ...] = ()
+    """N - 1 dampers beside the springs, N s/m or N m s/rad; empty where they are not known."""
+    viscous_friction: Estimate = Estimate(0.0)
+    """Between the first mass and ground, N s/m or N m s/rad."""
+    load_friction: Estimate = Estimate(0.0)
+    """Viscous, between the last mass and ground, N s/m or N m s/rad."""
+
+    def __post_init__(self) -> None:
+        if not self.masses:
+            raise ValueError(f"axis {self.name}: a chain has at least one mass")
+        if len(self.springs) != len(self.masses) - 1:
+            raise ValueError(
+                f"axis {self.name}: {len(self.masses)} masses need {len(self.masses) - 1} springs, "
+                f"got {len(self.springs)}"
+            )
+        if self.dampers and len(self.dampers) != len(self.springs):
+            raise ValueError(
+                f"axis {self.name}: {len(self.springs)} springs need as many dampers, "
+                f"got {len(self.dampers)}"
+            )
+
+    @property
+    def total_mass(self) -> float:
+        """Sum of the chain's masses, kg or kg m2."""
+        return sum(m.value for m in self.masses)
+
+
+@dataclass(frozen=True)
+class Coupling:
+    """Off-diagonal entry of the mass matrix between the last masses of two chains."""
+
+    axes: tuple[str, str]
+    value: float
+    std: float = nan
+
+
+@dataclass(frozen=True)
+class MachineModel:
+    """Chains and their couplings: what ``model.yaml`` holds."""
+
+    axes: tuple[AxisModel, ...]
+    couplings: tuple[Coupling, ...] = ()
+    effects: tuple[Mapping[str, Any], ...] = field(default=())
+    """Named additions, as ``model.yaml`` has them: effect, axis, parameters."""
+
+    def __post_init__(self) -> None:
+        names = [axis.name for axis in self.axes]
+        if len(set(names)) != len(names):
+            raise ValueError(f"axis names must differ, got {names}")
+        for coupling in self.couplings:
+            a, b = coupling.axes
+            if a == b or a not in names or b not in names:
+                raise ValueError(f"coupling {a} - {b} does not join two axes of {names}")
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the axes in order."""
+        return tuple(axis.name for axis in self.axes)
+
+    @property
+    def first_masses(self) -> NDArray[np.intp]:
+        """Degree of freedom of each motor, shape (M,)."""
+        counts = [0, *(len(axis.masses) for axis in self.axes[:-1])]
+        return np.cumsum(counts).astype(np.intp)
+
+    @property
+    def last_masses(self) -> NDArray[np.intp]:
+        """Degree of freedom of each chain's last mass, shape (M,)."""
+        return np.cumsum([len(axis.masses) for axis in self.axes]).astype(np.intp) - 1
+
+    @property
+    def mass_matrix(self) -> FloatArray:
+        """M, shape (n, n), n the number of all masses."""
+        matrix = np.diag([m.value for axis in self.axes for m in axis.masses]).astype(np.float64)
+        last = dict(zip(self.names, self.last_masses, strict=True))
+        for coupling in self.couplings:
+            a, b = (last[name] for name in coupling.axes)
+            matrix[a, b] += coupling.value
+            matrix[b, a] += coupling.value
+        return matrix
+
+    @property
+    def stiffness_matrix(self) -> FloatArray:
+        """K, shape (n, n)."""
+        return self._between_neighbours([axis.springs for axis in self.axes])
+
+    @property
+    def damping_matrix(self) -> FloatArray:
+        """C, shape (n, n): dampers beside the springs, viscous friction at motors and loads."""
+        matrix = self._between_neighbours([axis.dampers for axis in self.axes])
+        for first, last, axis in zip(self.first_masses, self.last_masses, self.axes, strict=True):
+            matrix[first, first] += axis.viscous_friction.value
+            matrix[last, last] += axis.load_friction.value
+        return matrix
+
+    def _between_neighbours(self, elements: Sequence[tuple[Estimate, ...]]) -> FloatArray:
+        n = sum(len(axis.masses) for axis in self.axes)
+        matrix = np.zeros((n, n))
+        for first, chain in zip(self.first_masses, elements, strict=True):
+            for k, element in enumerate(chain):
+                a = first + k
+                matrix[np.ix_([a, a + 1], [a, a + 1])] += element.value * np.array(
+                    [[1.0, -1.0], [-1.0, 1.0]]
+                )
+        return matrix
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values in the form of ``model.yaml``; an unknown standard error is null."""
+        return {
+            "format": FORMAT,
+            "axes": [
+                {
+                    "name": axis.name,
+                    "kind": axis.kind,
+                    "masses": [_plain(e) for e in axis.masses],
+                    "springs": [_plain(e) for e in axis.springs],
+                    "dampers": [_plain(e) for e in axis.dampers],
+                }
+                for axis in self.axes
+            ],
+            "couplings": [
+                {"axes": list(c.axes), **_plain(Estimate(c.value, c.std))} for c in self.couplings
+            ],
+            "effects": [
+                *(_friction(axis) for axis in self.axes if _has_friction(axis)),
+                *(dict(effect) for effect in self.effects),
+            ],
+        }
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> "MachineModel":
+        """Inverse of :meth:`as_dict`.
+
+        Raises
+        ------
+        ValueError
+            If a key is missing or unknown, or a value is no number.
+        """
+        _only_keys(data, {"format", "axes", "couplings", "effects"}, "model")
+        if data.get("format") != FORMAT:
+            raise ValueError(f"format must be {FORMAT}, got {data.get('format')!r}")
+        friction: dict[str, Mapping[str, Any]] = {}
+        effects: list[Mapping[str, Any]] = []
+        for effect in data.get("effects") or ():
+            if effect.get("effect") == "viscous_friction":
+                friction[effect["axis"]] = effect["parameters"]
+            else:
+                effects.append(effect)
+        axes = []
+        none: Mapping[str, Any] = {}
+        for axis in data["axes"]:
+            held = friction.get(str(axis["name"]), none)
+            _only_keys(axis, {"name", "kind", "masses", "springs", "dampers"}, "axis")
+            if axis["kind"] not in ("rotary", "linear"):
+                raise ValueError(f"kind must be rotary or linear, got {axis['kind']!r}")
+            axes.append(
+                AxisModel(
+                    name=str(axis["name"]),
+                    kind=axis["kind"],
+                    masses=tuple(_estimate(e) for e in axis["masses"]),
+                    springs=tuple(_estimate(e) for e in axis.get("springs") or ()),
+                    dampers=tuple(_estimate(e) for e in axis.get("dampers") or ()),
+                    viscous_friction=_estimate(held.get("coefficient", 0.0)),
+                    load_friction=_estimate(held.get("load_coefficient", 0.0)),
+                )
+            )
+        couplings = []
+        for coupling in data.get("couplings") or ():
+            a, b = coupling["axes"]
+            e = _estimate({k: v for k, v in coupling.items() if k != "axes"})
+            couplings.append(Coupling((str(a), str(b)), e.value, e.std))
+        return cls(tuple(axes), tuple(couplings), tuple(effects))
+
+
+def _has_friction(axis: AxisModel) -> bool:
+    return axis.viscous_friction.value != 0.0 or axis.load_friction.value != 0.0
+
+
+def _friction(axis: AxisModel) -> dict[str, Any]:
+    unit = {"unit": "N m s/rad" if axis.kind == "rotary" else "N s/m"}
+    parameters = {"coefficient": _plain(axis.viscous_friction) | unit}
+    if axis.load_friction.value != 0.0:
+        parameters["load_coefficient"] = _plain(axis.load_friction) | unit
+    return {"effect": "viscous_friction", "axis": axis.name, "parameters": parameters}
+
+
+def _plain(estimate: Estimate) -> dict[str, float | None]:
+    known = bool(np.isfinite(estimate.std))
+    return {"value": float(estimate.value), "std": float(estimate.std) if known else None}
+
+
+def _estimate(data: Any) -> Estimate:
+    if isinstance(data, Mapping):
+        _only_keys(data, {"value", "std", "unit"}, "number")
+        std = data.get("std")
+        return Estimate(_number(data["value"]), nan if std is None else _number(std))
+    return Estimate(_number(data))
+
+
+def _number(data: Any) -> float:
+    if isinstance(data, bool) or not isinstance(data, int | float):
+        raise ValueError(f"expected a number, got {data!r}")  # noqa: TRY004
+    return float(data)
+
+
+def _only_keys(data: Mapping[str, Any], known: set[str], what: str) -> None:
+    unknown = set(data) - known
+    if unknown:
+        raise ValueError(f"{what} has unknown keys {sorted(unknown)}; known are {sorted(known)}")

@@ -1,0 +1,91 @@
+"""The session folder: where every stage leaves its result and finds that of the one before."""
+
+import json
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from fieldtool.errors import OutputError
+
+
+@dataclass(frozen=True)
+class SessionFolder:
+    """Names of the files of one session."""
+
+    path: Path
+
+    @classmethod
+    def create(cls, path: Path) -> "SessionFolder":
+        """Make the folder, and see that it can be written, before anything is measured.
+
+        Raises
+        ------
+        OutputError
+            If it can not be made or written.
+        """
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+            probe = path / ".writable"
+            probe.write_bytes(b"x" * 4096)
+            probe.unlink()
+        except OSError as error:
+            raise OutputError(
+                f"{path}: results can not be written here ({error.strerror}). Choose another folder "
+                "with --out. Nothing was moved."
+            ) from error
+        return cls(path)
+
+    @property
+    def machine(self) -> Path:
+        """Resolved machine profile."""
+        return self.path / "machine.yaml"
+
+    @property
+    def parameters_before(self) -> Path:
+        """Backup of all drives' parameters."""
+        return self.path / "parameters-before.yaml"
+
+    @property
+    def recording(self) -> Path:
+        """Raw data."""
+        return self.path / "recording.h5"
+
+    @property
+    def frequency_response(self) -> Path:
+        """Responses."""
+        return self.path / "frequency-response.h5"
+
+    @property
+    def model(self) -> Path:
+        """Identified model."""
+        return self.path / "model.yaml"
+
+    @property
+    def tuning(self) -> Path:
+        """Designed parameters."""
+        return self.path / "tuning.yaml"
+
+    @property
+    def journal(self) -> Path:
+        """What was written to the drives."""
+        return self.path / "write-journal.yaml"
+
+    @property
+    def events(self) -> Path:
+        """What happened, one JSON object a line."""
+        return self.path / "events.jsonl"
+
+    @property
+    def picture(self) -> Path:
+        """Measured and modelled responses."""
+        return self.path / "responses.png"
+
+    def note(self, event: str, **details: Any) -> None:
+        """Append one event to the log; a log that can not be written stops nothing."""
+        line = {"time": datetime.now(UTC).isoformat(timespec="milliseconds"), "event": event}
+        try:
+            with self.events.open("a", encoding="utf-8") as log:
+                log.write(json.dumps({**line, **details}, default=str) + "\n")
+        except OSError:
+            return

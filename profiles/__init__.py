@@ -1,0 +1,1 @@
+"""What fieldtool knows of drives and machines: data files only."""

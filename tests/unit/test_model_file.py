@@ -1,0 +1,100 @@
+"""model.yaml survives the disk, and a faulty one is refused with file and line."""
+
+from math import isnan
+from pathlib import Path
+
+import pytest
+
+from fieldtool.errors import FileFormatError, OutputError
+from fieldtool.records.model import AxisModel, Coupling, Estimate, MachineModel
+from fieldtool.records.model_file import read_model, write_model
+
+MODEL = MachineModel(
+    axes=(
+        AxisModel(
+            "x",
+            "rotary",
+            (Estimate(1 / 3, 1e-5), Estimate(2.5e-7)),
+            (Estimate(1234.5678901234567, 1.0),),
+            (Estimate(1e-3, 1e-20),),
+            Estimate(0.02, 0.001),
+        ),
+        AxisModel("slide", "linear", (Estimate(95.1),), ()),
+    ),
+    couplings=(Coupling(("x", "slide"), -0.25, 0.01),),
+    effects=(
+        {
+            "effect": "measurement_delay",
+            "axis": "x",
+            "parameters": {"delay": {"value": 1.1e-4, "std": 1e-6, "unit": "s"}},
+        },
+    ),
+)
+
+
+def test_a_model_survives_the_disk_exactly(tmp_path: Path) -> None:
+    write_model(MODEL, tmp_path / "model.yaml")
+    again = read_model(tmp_path / "model.yaml")
+    assert again.as_dict() == MODEL.as_dict()
+    assert again.axes[0].masses[0] == MODEL.axes[0].masses[0]
+    assert isnan(again.axes[0].masses[1].std)
+    assert again.effects == MODEL.effects
+
+
+def test_plain_numbers_stand_for_estimates(tmp_path: Path) -> None:
+    path = tmp_path / "model.yaml"
+    path.write_text(
+        "format: fieldtool-model/1\n"
+        "axes: [{name: x, kind: rotary, masses: [1, 2.0], springs: [{value: 1e3}]}]\n"
+    )
+    axis = read_model(path).axes[0]
+    assert [mass.value for mass in axis.masses] == [1.0, 2.0]
+    assert axis.springs[0].value == 1000.0
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("fieldtool-model/1", "fieldtool-model/2", r"model\.yaml:1: 'format'"),
+        ("kind: linear", "kind: round", r"model\.yaml:\d+: 'axes.1.kind'.*'round'"),
+        ("kind: linear", "knid: linear", r"model\.yaml:\d+: the key 'axes.1.knid' is not known"),
+        ("value: 95.1", "value: heavy", r"model\.yaml:\d+: 'axes.1.masses.0.*the file has 'heavy'"),
+        ("value: 95.1", "value: .inf", r"model\.yaml:\d+: .*finite"),
+        ("value: -0.25", "value: yes", r"model\.yaml:\d+: 'couplings.0.value': expected a number"),
+        ("measurement_delay", "time_lag", r"model\.yaml:\d+: 'effects.\d.effect'"),
+        (
+            "axis: x\n",
+            "axis: q\n",
+            r"model\.yaml:\d+: effect \w+ is on axis 'q', the axes are x, s",
+        ),
+        ("springs: []", "springs: [1.0]", "1 masses need 0 springs, got 1"),
+    ],
+)
+def test_a_faulty_model_is_refused_with_the_line(
+    tmp_path: Path, old: str, new: str, words: str
+) -> None:
+    path = tmp_path / "model.yaml"
+    write_model(MODEL, path)
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new))
+    with pytest.raises(FileFormatError, match=words):
+        read_model(path)
+
+
+def test_a_coupling_to_nowhere_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "model.yaml"
+    path.write_text(
+        "format: fieldtool-model/1\n"
+        "axes: [{name: x, kind: rotary, masses: [1]}]\n"
+        "couplings: [{axes: [x, y], value: 1}]\n"
+    )
+    with pytest.raises(FileFormatError, match="coupling x - y does not join two axes"):
+        read_model(path)
+
+
+def test_missing_and_unwritable(tmp_path: Path) -> None:
+    with pytest.raises(FileFormatError, match="can not be opened"):
+        read_model(tmp_path / "model.yaml")
+    with pytest.raises(OutputError, match="there is no folder"):
+        write_model(MODEL, tmp_path / "no" / "model.yaml")
