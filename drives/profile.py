@@ -126,10 +126,21 @@ class DriveProfile(_Part):
     """Exponent of ten that 0x60C2:2 gets."""
     volatile_commands: tuple[Address, ...] = ()
     """Writable objects that are commands, not parameters: never backed up nor restored."""
+    feed_forward: tuple[str, ...] = ()
+    """Names of parameters that are zero while frequency responses are measured: feed-forward of
+    a target that is linear between SYNCs makes the torque jump at every SYNC, just where it is
+    sampled."""
     parameters: dict[str, ParameterInfo]
     """By name, in the order in which they are written."""
     store: Store | None = None
     path: Path = Field(default=Path(), exclude=True)
+
+    @model_validator(mode="after")
+    def _known_names(self) -> "DriveProfile":
+        for k, name in enumerate(self.feed_forward):
+            if name not in self.parameters:
+                raise _LocatedError(("feed_forward", k), f"{name} is not among the parameters")
+        return self
 
 
 class Limits(_Part):

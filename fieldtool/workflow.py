@@ -379,8 +379,14 @@ def _session(
 
 
 def _measure(session: _Session, group: CanopenGroup) -> float:
-    machine, screen, folder = session.machine, session.screen, session.folder
+    machine, folder = session.machine, session.folder
     take_backup(machine.name, group.drives, folder.parameters_before)
+    with group.without_feed_forward():
+        return _measure_both_passes(session, group)
+
+
+def _measure_both_passes(session: _Session, group: CanopenGroup) -> float:
+    machine, screen, folder = session.machine, session.screen, session.folder
     setting = _setting(machine, group, prior_model(machine))
     cycle_time = chosen_cycle_time(setting.model, group.shortest_cycle)
     plan = classic_plan(setting, [axis.name for axis in machine.axes if axis.may_float], cycle_time)

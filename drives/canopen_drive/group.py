@@ -12,6 +12,7 @@ from drives.canopen_drive.line import Line
 from drives.canopen_drive.motion import CanopenMotion
 from drives.cia402 import Mode
 from drives.errors import DrivesError, LimitsError, NothingMovedError
+from drives.objects import ObjectInfo
 from drives.profile import DriveProfile, MachineProfile, load_drive
 
 START_NODE, ENTER_PRE_OPERATIONAL = 0x01, 0x80
@@ -50,6 +51,26 @@ class CanopenGroup:
     def shortest_cycle(self) -> float:
         """Shortest cycle time that fits the bus, seconds."""
         return shortest_cycle(len(self._drives), self.machine.bus.bitrate)
+
+    @contextmanager
+    def without_feed_forward(self) -> Iterator[None]:
+        """Switch the drives' feed-forward off while frequency responses are measured.
+
+        On leaving, whatever happened, it is what it was.
+
+        Raises
+        ------
+        SdoError, NotSupportedError
+            If a drive does not take it; then those before have their old values again.
+        """
+        with ExitStack() as stack:
+            for drive in self._drives:
+                changes = setup.TemporaryObjects(drive)
+                stack.callback(self._put_back, changes)
+                for name in drive.profile.feed_forward:
+                    parameter = drive.profile.parameters[name]
+                    changes.change(ObjectInfo(parameter.object, parameter.type, name), 0)
+            yield
 
     @contextmanager
     def motion(self, cycle_time: float, free: Collection[str] = ()) -> Iterator[CanopenMotion]:

@@ -41,7 +41,7 @@ _QUICK_STOP_RAMP = (2, 6)
 _STAY_STOPPED = (5, 6)
 _STOP_MARGIN, _STOP_EXTRA = 2.0, 0.5
 """A stop may take so many times its ramp, and so many seconds more."""
-_INT32 = 2**31
+_INT16, _INT32 = 2**15, 2**31
 _LIMITED, _REACHED = int(Status.INTERNAL_LIMIT), int(Status.TARGET_REACHED)
 _MODE_12, _ERROR = int(Status.MODE_12), int(Status.FOLLOWING_ERROR)
 _HALT = int(Control.HALT)
@@ -146,12 +146,18 @@ class MotionControl:
         return word
 
     def latch(self, counts: int, per_mille: int, velocity: float) -> None:
-        """Take what the firmware sampled: counts, per mille, rad/s."""
+        """Take what the firmware sampled: counts, per mille, rad/s.
+
+        Counts wrap at 32 bits as an encoder's do; speed and torque stay at the ends of their types.
+        """
         if not -_INT32 <= counts < _INT32:
             counts = (counts + _INT32) % (2 * _INT32) - _INT32
+        speed = int(velocity * self._scales.counts_per_unit)
+        if not -_INT32 <= speed < _INT32:
+            speed = _int32(speed)
         self.position_actual = counts
-        self.torque_actual = per_mille
-        self.velocity_actual = int(velocity * self._scales.counts_per_unit)
+        self.torque_actual = per_mille if -_INT16 <= per_mille < _INT16 else _int16(per_mille)
+        self.velocity_actual = speed
 
     @property
     def following_error(self) -> int:
@@ -163,7 +169,7 @@ class MotionControl:
     def torque_demand(self) -> int:
         """Object 0x6074, per mille."""
         demand = self._axes.reference_torque(self._axis) * 1000.0 / self._scales.rated_torque
-        return max(-32768, min(32767, round(demand)))
+        return _int16(demand)
 
     # -- targets ----------------------------------------------------------------------------------
 
@@ -439,3 +445,7 @@ class MotionControl:
 
 def _int32(value: float) -> int:
     return max(-_INT32, min(_INT32 - 1, round(value)))
+
+
+def _int16(value: float) -> int:
+    return max(-_INT16, min(_INT16 - 1, round(value)))

@@ -17,6 +17,7 @@ from drives.sim.dictionary import DriveDictionary, Key, Value
 from drives.sim.eds import packaged_eds
 from drives.sim.emergency import (
     HEARTBEAT_LOST,
+    PDO_TOO_SHORT,
     EmergencyProducer,
     ErrorRegister,
     refuse_cob_id,
@@ -169,6 +170,7 @@ class DriveNode:
             self.dictionary.set_node_id(self.nmt.node_id)
         if not whole:
             self._connection_aborted()
+            self.emergency.clear(PDO_TOO_SHORT)
         self.memory.recall(self.dictionary, all_of_it=whole)
         self.heartbeat.start(0)
         if whole:

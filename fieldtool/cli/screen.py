@@ -149,13 +149,14 @@ def model_table(model: MachineModel, truth: MachineModel | None) -> Table:
         table.add_column("error", justify="right")
     for k, axis in enumerate(model.axes):
         true_axis = truth.axes[k] if truth else None
-        for what, values in (
-            ("mass", axis.masses),
-            ("spring", axis.springs),
-            ("damper", axis.dampers),
+        for what, plural in (
+            ("mass", "masses"),
+            ("spring", "springs"),
+            ("damper", "dampers"),
         ):
+            values: Sequence[Estimate] = getattr(axis, plural)
             known: Sequence[Estimate | None] = (
-                getattr(true_axis, what + "s") if true_axis else [None] * len(values)
+                getattr(true_axis, plural) if true_axis else [None] * len(values)
             )
             for j, (value, true) in enumerate(zip(values, known, strict=False)):
                 _row(

@@ -107,10 +107,10 @@ def fit(
             jacobian,
             method="trf",
             x_scale="jac",
-            ftol=1e-10 if floor == 0.0 else 1e-3,
+            ftol=1e-10 if floor == 0.0 else 1e-2,
             xtol=1e-12,
             gtol=1e-12,
-            max_nfev=evaluations if floor == 0.0 else 30,
+            max_nfev=evaluations if floor == 0.0 else min(evaluations, 30),
             args=(floor,),
         )
         x = result.x

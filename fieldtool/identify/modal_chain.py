@@ -21,6 +21,8 @@ from fieldtool.identify.spectrum import Spectrum
 from fieldtool.records.model import Estimate, Kind
 
 FloatArray = NDArray[np.float64]
+SEEN = 5.0
+"""Standard errors that a mode's largest component must have to count as seen."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +56,8 @@ def reduction_inputs(
     Raises
     ------
     NotEnoughDataError
-        If a pair of axes was not measured: its share of the rigid body is not known.
+        If a pair of axes was not measured, so that its share of the rigid body is not known, or a
+        mode does not rise out of the noise at any motor.
     """
     if not modal.parts.pairs.all():
         i, j = np.argwhere(~modal.parts.pairs)[0]
@@ -62,6 +65,7 @@ def reduction_inputs(
             f"axes {modal.names[i]} and {modal.names[j]}: no response between them was measured, "
             "so their coupling and masses are not known; measure one"
         )
+    _check_modes_are_seen(modal)
     known = dict(motor_masses or {})
     axes, rows = [], []
     low, low_rows = _low_gains(modal)
@@ -100,6 +104,18 @@ def reduce_modes(
     """Masses, springs and couplings from fitted modes; arguments as :func:`reduction_inputs`."""
     inputs = reduction_inputs(modal, masses, kinds, motor_masses)
     return reduce_machine(inputs.axes, inputs.cross_gains, inputs.covariance)
+
+
+def _check_modes_are_seen(modal: ModalModel) -> None:
+    faint = np.flatnonzero(modal.significance < SEEN)
+    if faint.size:
+        seen = modal.omega.size - faint.size
+        where = ", ".join(f"{w / (2 * np.pi):.4g}" for w in modal.omega[faint])
+        raise NotEnoughDataError(
+            f"only {seen} of {modal.omega.size} modes rise out of the noise; those put at {where} "
+            "Hz are not established. Excite more strongly or longer, over a wider band, or "
+            "describe the axes with fewer masses"
+        )
 
 
 def _std(row: FloatArray, covariance: FloatArray) -> float:
@@ -165,9 +181,9 @@ def _low_gains(modal: ModalModel) -> tuple[FloatArray, FloatArray]:
     """A_L, shape (M,), and derivatives, shape (M, P)."""
     mass, moved = _mass_derivatives(modal)
     axes = np.arange(mass.shape[0])
-    low = 1.0 / mass[axes, axes]
+    low: FloatArray = 1.0 / np.diag(mass).astype(np.float64)
     rows: FloatArray = -moved[axes, axes] * low[:, None] ** 2
-    return np.asarray(low, dtype=np.float64), rows
+    return low, rows
 
 
 def _cross_gains(modal: ModalModel) -> tuple[tuple[CrossGain, ...], FloatArray]:

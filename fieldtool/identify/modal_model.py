@@ -117,6 +117,16 @@ class ModalModel:
             pieces.append(self.delays)
         return np.concatenate(pieces)
 
+    @property
+    def significance(self) -> FloatArray:
+        """Largest component of each mode in standard errors, shape (n,).
+
+        Below about 5 a mode may be nothing but noise: the fit always finds as many as it is told.
+        """
+        std = self.std("phi")
+        ratios = np.divide(np.abs(self.phi), std, out=np.full(std.shape, np.inf), where=std > 0.0)
+        return np.asarray(ratios.max(axis=0, initial=0.0), dtype=np.float64)
+
     def std(self, part: str) -> FloatArray:
         """Standard errors of one part: omega, zeta, phi, chi, rigid, friction or delay.
 

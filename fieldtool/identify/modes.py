@@ -27,10 +27,14 @@ from fieldtool.records.model import MachineModel
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
-GENTLE_START = (0.03, 3e-3, 3e-4, 3e-5, 0.0)
-"""Relative errors added to the noise, one stage after another."""
+COARSE = (0.03, 3e-3)
+"""Relative errors added to the noise while starts are compared, one stage after another."""
+FINE = (3e-4, 3e-5, 0.0)
+"""And then, down to the noise itself."""
 GOOD_ENOUGH = 1.5
 """Misfit over noise at which no further start is tried."""
+FULL_FITS = 2
+"""How many of the best starts are fitted to the end."""
 SPREAD = ((0, 0.01), (0, 0.001), (1, 0.01), (2, 0.01), (4, 0.01), (0, 0.05), (8, 0.01))
 """Starts of the pole search: pairs more than asked for, damping ratio."""
 
@@ -83,8 +87,8 @@ def fit_modes(
         )
     delays = _first_delays(data) if fit_delay else np.zeros(len(data.names))
     best: Fit | None = None
-    for poles in _starts(data, modes, delays, fit_friction, prior):
-        found = _fit_from(data, parts, poles, delays)
+    for start in _tried_starts(data, parts, delays, prior):
+        found = _fit_from(data, parts, start, FINE, 60)
         if best is None or found.chi2 < best.chi2:
             best = found
         if best.excess < GOOD_ENOUGH:
@@ -92,6 +96,19 @@ def fit_modes(
     if best is None:
         raise NotEnoughDataError("no start for the fit could be found; measure more frequencies")
     return _model(data, parts, best)
+
+
+def _tried_starts(
+    data: ResponseMatrix, parts: ModalParts, delays: FloatArray, prior: MachineModel | None
+) -> list[FloatArray]:
+    """Parameter vectors after a coarse fit, best first; the first that is good ends the search."""
+    tried: list[tuple[float, FloatArray]] = []
+    for poles in _starts(data, parts.modes, delays, parts.friction, prior):
+        coarse = _fit_from(data, parts, _first_guess(data, parts, poles, delays), COARSE, 15)
+        tried.append((coarse.chi2, coarse.x))
+        if coarse.excess < GOOD_ENOUGH:
+            break
+    return [x for _, x in sorted(tried, key=lambda pair: pair[0])[:FULL_FITS]]
 
 
 def _starts(
@@ -198,9 +215,10 @@ def _residues(
     return residues, rigid
 
 
-def _fit_from(
+def _first_guess(
     data: ResponseMatrix, parts: ModalParts, poles: ComplexArray, delays: FloatArray
-) -> Fit:
+) -> FloatArray:
+    """Parameter vector for given poles, by linear least squares."""
     residues, rigid = _residues(data, poles, delays)
     phi = np.array([_rank_one(residues[:, :, r], parts.pairs) for r in range(poles.size)])
     x = np.zeros(parts.count)
@@ -210,16 +228,25 @@ def _fit_from(
     x[at["phi"]] = phi.T.ravel()
     x[at["rigid"]] = rigid[parts.upper]
     x[at["delay"]] = delays[: at["delay"].stop - at["delay"].start]
+    return x
 
-    def residuals(y: FloatArray, floor: float) -> FloatArray:
-        response = modal_response(parts, y, data.omega)
-        return np.concatenate([data.residuals(response, floor), _sum_rule(parts, y)])
 
-    def jacobian(y: FloatArray, floor: float) -> FloatArray:
-        derivatives = modal_derivatives(parts, y, data.omega)
-        return np.vstack([data.jacobian(derivatives, floor), _sum_rule_jacobian(parts, y)])
+def _fit_from(
+    data: ResponseMatrix,
+    parts: ModalParts,
+    start: FloatArray,
+    floors: tuple[float, ...],
+    evaluations: int,
+) -> Fit:
+    def residuals(x: FloatArray, floor: float) -> FloatArray:
+        response = modal_response(parts, x, data.omega)
+        return np.concatenate([data.residuals(response, floor), _sum_rule(parts, x)])
 
-    return fit(residuals, jacobian, x, floors=GENTLE_START, evaluations=100)
+    def jacobian(x: FloatArray, floor: float) -> FloatArray:
+        derivatives = modal_derivatives(parts, x, data.omega)
+        return np.vstack([data.jacobian(derivatives, floor), _sum_rule_jacobian(parts, x)])
+
+    return fit(residuals, jacobian, start, floors, evaluations)
 
 
 def _rank_one(residue: FloatArray, pairs: NDArray[np.bool_]) -> FloatArray:

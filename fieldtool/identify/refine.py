@@ -31,6 +31,8 @@ from fieldtool.records.model import Estimate, MachineModel
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
+FURTHEST = 12.0
+"""Natural logarithm of the largest change from the start that a fit may try."""
 UNKNOWN_ABOVE = 0.5
 """Relative standard error above which the data do not tell a parameter."""
 
@@ -200,7 +202,9 @@ class _Problem:
         for k, change in zip(self.free, x, strict=True):
             p = self.parameters[k]
             values[k] = (
-                values[k] * np.exp(change) if p.logarithmic else values[k] + change * p.scale
+                values[k] * np.exp(np.clip(change, -FURTHEST, FURTHEST))
+                if p.logarithmic
+                else values[k] + change * p.scale
             )
         return values
 

@@ -1,5 +1,6 @@
 """The lock-step bus as python-can's tools, a foreign CANopen client and a host see it."""
 
+import queue
 import struct
 import threading
 import time
@@ -256,6 +257,7 @@ def network():
     """python canopen on the lock-step bus: a client from other hands than the node."""
     with LockstepBus(machine=machine()) as opened:
         net = canopen.Network(opened)
+        net.NOTIFIER_CYCLE = 0.05
         net.connect()
         yield net
         net.disconnect()
@@ -324,12 +326,17 @@ class TestForeignClient:
         network.bus.machine.inject(faults.DriveFault(1, 0x4310, 0x08))
         assert remote.emcy.wait(timeout=2.0).code == 0x4310
 
-    def test_heartbeat_and_state(self, network, remote):
+    def test_heartbeat(self, network, remote):
+        beats = queue.Queue()
+        network.subscribe(0x701, lambda _cob, data, stamp: beats.put((bytes(data), stamp)))
         remote.nmt.state = "OPERATIONAL"
         remote.sdo[0x1017].raw = 10
-        network.bus.clock.wait_until(network.bus.clock.now() + 0.05)
-        remote.nmt.wait_for_heartbeat(timeout=2.0) if False else None
-        assert remote.nmt.state == "OPERATIONAL"
+        network.bus.clock.wait_until(0.025)
+        assert [beats.get(timeout=2.0) for _ in range(3)] == [
+            (b"\x05", 0.0),
+            (b"\x05", 0.01),
+            (b"\x05", 0.02),
+        ]
 
     def test_identity_scan(self, network):
         network.scanner.search(limit=5)

@@ -18,9 +18,7 @@ class TestScheduler:
     def test_calls_come_in_order_of_time_then_of_making(self, times):
         scheduler, called = VirtualScheduler(), []
         for number, time in enumerate(times):
-            scheduler.add_at(
-                time, lambda time=time, number=number: called.append((time, number))
-            )
+            scheduler.add_at(time, lambda time=time, number=number: called.append((time, number)))
         scheduler.run_due(2_000)
         assert called == sorted(called)
         assert len(called) == len(times)

@@ -244,7 +244,9 @@ class TestStops:
         assert moving.read("i", 0x6064) == pytest.approx(position, abs=20)
         assert moving.statusword() & REACHED
 
-    @pytest.mark.parametrize(("index", "word", "state"), [(0x605B, 0x06, READY), (0x605C, 0x07, ON)])
+    @pytest.mark.parametrize(
+        ("index", "word", "state"), [(0x605B, 0x06, READY), (0x605C, 0x07, ON)]
+    )
     def test_leaving_on_a_ramp(self, moving, index, word, state):
         moving.write("h", index, 0, 1)
         moving.control(word)
@@ -333,8 +335,11 @@ def test_linear_axis_counts_are_metres(rig_of):
     assert rig.machine.axes.position(0) == pytest.approx(0.01, abs=1e-5)
 
 
-def test_counts_beyond_32_bits_wrap(rig):
-    node = rig.machine.node(1)
-    node.motion.latch(2**31 + 5, 0, 0.0)
-    assert node.motion.position_actual == -(2**31) + 5
-    assert struct.pack("<i", node.motion.position_actual)
+def test_values_beyond_their_types(rig):
+    """Counts wrap, speed and torque saturate: a PDO can always be packed."""
+    motion = rig.machine.node(1).motion
+    motion.latch(2**31 + 5, 40_000, 1e9)
+    assert motion.position_actual == -(2**31) + 5
+    assert motion.torque_actual == 2**15 - 1
+    assert motion.velocity_actual == 2**31 - 1
+    assert struct.pack("<ihi", motion.position_actual, motion.torque_actual, motion.velocity_actual)

@@ -1,6 +1,7 @@
 """Process data of the simulated drive: mapping procedure, transmission types, SYNC."""
 
 import struct
+from itertools import pairwise
 
 import pytest
 
@@ -156,6 +157,8 @@ class TestAtSync:
         mapped.send(0x201, bytes(7))
         assert mapped.emergencies() == [0x8210]
         assert mapped.read("B", 0x1001) & 0x10
+        mapped.nmt(0x82)
+        assert mapped.read("B", 0x1001) == 0
 
     def test_no_pdo_unless_operational(self, mapped):
         mapped.nmt(0x80)
@@ -198,7 +201,7 @@ class TestEventDriven:
         rig.run(0.1)
         times = [t for t, cob, _ in rig.frames if cob == 0x181]
         assert len(times) == 5
-        assert {b - a for a, b in zip(times, times[1:], strict=False)} == {20_000_000}
+        assert {b - a for a, b in pairwise(times)} == {20_000_000}
 
     def test_inhibit_time(self, rig):
         rig.write("I", 0x1800, 1, 0xC0000181)

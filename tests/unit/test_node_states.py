@@ -118,7 +118,9 @@ class TestStatuswordBits:
 WORDS = st.lists(st.sampled_from([0, 2, 6, 7, 0xF, 0x80, 0x1F, 0x10F]), max_size=25)
 
 
-@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 @given(words=WORDS)
 def test_any_sequence_keeps_to_the_table(rig_of, words):
     """With all ramps switched off the drive does what the table says, and nothing else."""
