@@ -7,7 +7,7 @@ a simulation may stand behind the bus.
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal, Protocol
@@ -26,6 +26,7 @@ from fieldtool.experiment.forecast import AxisForecast, Setting, forecast
 from fieldtool.experiment.plan import SweepPlan
 from fieldtool.experiment.runner import Axes, Progress, check_directions, run_plan
 from fieldtool.frf.response import save_responses
+from fieldtool.identify.classic import without_friction
 from fieldtool.identify.prediction import LoadPrediction, predict_load
 from fieldtool.identify.recorded import Identified, identify_recording
 from fieldtool.records.closed_loop import loop_from_parameters
@@ -412,15 +413,11 @@ def _measure_both_passes(session: _Session, group: CanopenGroup) -> float:
         except IdentificationError as error:
             session.warn(f"The first pass alone can not be identified ({error})")
             return machine_time
-        second = refined_plan(
-            Setting(found.model, setting.loops, setting.limits, setting.centre),
-            found.damping_ratios,
-            cycle_time,
-        )
+        now_known = replace(setting, model=without_friction(found.model))
+        second = refined_plan(now_known, found.damping_ratios, cycle_time)
         if not second.sweeps:
             return machine_time
-        checked = Setting(found.model, setting.loops, setting.limits, setting.centre)
-        screen.plan(second, forecast(second, checked), second.expected_duration(SETTLE_GUESS))
+        screen.plan(second, forecast(second, now_known), second.expected_duration(SETTLE_GUESS))
         screen.stage("Measure, second pass: at and beside every mode")
         machine_time += run_plan(group, second, axes, keep, screen.progress)
     return machine_time

@@ -112,7 +112,8 @@ def _stop_key() -> Iterator[_StopKey]:
 
 
 def _console(as_json: bool) -> Console:
-    return Console(stderr=as_json, highlight=False, soft_wrap=False)
+    console = Console(stderr=as_json, highlight=False)
+    return console if console.is_terminal else Console(stderr=as_json, highlight=False, width=120)
 
 
 def _folder(out: Path | None, name: str) -> Path:
@@ -136,6 +137,8 @@ def _options(plan: str, write: bool, store: bool, motor: str) -> workflow.Option
 
 def _asker(console: Console, yes: bool) -> Callable[[Sequence[Change]], bool]:
     def ask(changes: Sequence[Change]) -> bool:
+        if yes:
+            return True
         rows = [
             {
                 "axis": c.axis,
@@ -149,8 +152,6 @@ def _asker(console: Console, yes: bool) -> Callable[[Sequence[Change]], bool]:
         ]
         raw: Mapping[Any, Any] = {(c.axis, c.name): (c.before_raw, c.after_raw) for c in changes}
         console.print(parameter_rows(rows, raw))
-        if yes:
-            return True
         if not sys.stdin.isatty():
             console.print(
                 "  Not written: there is nobody to ask. Use --yes to write without asking."

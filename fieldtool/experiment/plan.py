@@ -12,6 +12,9 @@ import numpy as np
 
 from fieldtool.records.model import FloatArray
 
+BLOCK_CYCLES = 250
+"""So many cycles let the frequency of a block come within 0.2 % of what was wanted."""
+
 SweepKind = Literal["direct, others free", "direct, others locked", "cross-coupled"]
 
 
@@ -85,9 +88,7 @@ class SweepPlan:
         )
 
 
-def tone_near(
-    frequency: float, amplitude: float, cycle_time: float, block_time: float = 1.0
-) -> Tone:
+def tone_near(frequency: float, amplitude: float, cycle_time: float) -> Tone:
     """Return the tone next to a frequency whose block has whole periods and whole cycles.
 
     Parameters
@@ -97,9 +98,7 @@ def tone_near(
     amplitude
         rad or m.
     cycle_time
-        Seconds.
-    block_time
-        Blocks are at least so long, and at least one period, seconds.
+        Seconds.  A block has at least BLOCK_CYCLES cycles and one period.
 
     Raises
     ------
@@ -111,7 +110,7 @@ def tone_near(
             f"frequency {frequency:g} Hz must be positive and at most a quarter of the sampling "
             f"rate, {0.25 / cycle_time:g} Hz"
         )
-    periods = max(1, int(np.ceil(block_time * frequency)))
+    periods = max(1, int(np.ceil(BLOCK_CYCLES * cycle_time * frequency)))
     samples = round(periods / (frequency * cycle_time))
     return Tone(periods, samples, cycle_time, amplitude)
 

@@ -8,8 +8,10 @@ response matrix G, and Z = inv(G) is what perfectly held axes would show::
     X = Re(Z) / (-w^2)      1 / A_L,i = X_ii      A_C,ij = [inv(X restricted to i, j)]_ij   as w -> 0
 
 so that position loops that give way a little do no harm, and friction, which acts in phase with
-the velocity and stays in Im(Z), neither.  Then order reduction, equations (2) to
-(22); at last the dampers, by a fit that keeps masses and springs, as the paper's conclusion says.
+the velocity and stays in Im(Z), neither.  Then order reduction, equations (2) to (22).  Dampers
+come from a non-linear fit, as the paper's conclusion says; it starts from the result of the order
+reduction, and moves masses, springs and couplings too, because each of them then rests on all
+measured points and not on single ones.  Both results have to agree.
 """
 
 from collections.abc import Mapping, Sequence
@@ -39,6 +41,10 @@ from fieldtool.records.model import Estimate, FloatArray, Kind, MachineModel
 
 RELATIVE_FLOOR = 5e-4
 """Of each response: what settling, quantisation and small distortion leave beside noise."""
+ALLOWED_APART = 0.1
+"""Relative difference between order reduction and refinement above which something is wrong."""
+SIGNIFICANT = 3.0
+"""Standard errors above which friction counts as seen."""
 DISAGREEMENT = 5.0
 """Standard errors between two ways to one number above which a note is made."""
 
@@ -129,8 +135,8 @@ def identify_classic(
         for k, found in enumerate(measured_cross):
             _set_variance(covariance, at + k, found.std)
     reduced = reduce_machine(axes, cross, covariance)
-    model, damping_note = _with_dampers(reduced.model, data, modal)
-    notes += [*reduced.notes, *damping_note]
+    model, refinement = _refined(reduced.model, data, modal)
+    notes += [*reduced.notes, *refinement]
     return ClassicResult(model, modal, reduced, free, low, measured_cross, tuple(notes))
 
 
@@ -207,25 +213,49 @@ def _compare(notes: list[str], what: str, other: Estimate, gain: Estimate) -> No
         )
 
 
-def _with_dampers(
-    model: MachineModel, data: ResponseMatrix, modal: ModalModel
+def _refined(
+    reduced: MachineModel, data: ResponseMatrix, modal: ModalModel
 ) -> tuple[MachineModel, Sequence[str]]:
-    """Fit dampers (and friction) with masses, springs and couplings held."""
-    friction = modal.parts.friction
-    held = [
-        f"{axis.name}.{part}[{k + 1}]"
-        for axis in model.axes
-        for part, count in (("mass", len(axis.masses)), ("spring", len(axis.springs)))
-        for k in range(count)
-    ] + [f"coupling[{c.axes[0]},{c.axes[1]}]" for c in model.couplings]
-    if not any(axis.springs for axis in model.axes):
-        return model, ()
+    """Fit everything to all points, starting from the order reduction; keep that if they disagree."""
     try:
-        fitted = refine(model, data, fixed=held, fit_friction=friction)
+        fitted = refine(reduced, data, fit_friction=modal.parts.friction)
+        if modal.parts.friction and not _friction_seen(fitted.model):
+            fitted = refine(without_friction(fitted.model), data)
     except IdentificationError as error:
-        return model, (f"The dampers could not be fitted: {error}",)
-    axes = tuple(
-        replace(before, dampers=after.dampers, viscous_friction=after.viscous_friction)
-        for before, after in zip(model.axes, fitted.model.axes, strict=True)
+        return reduced, (f"The refinement failed, so dampers are not known: {error}",)
+    notes = [unknown.reason for unknown in fitted.unknown]
+    apart, what = _largest_difference(reduced, fitted.model)
+    if apart > ALLOWED_APART:
+        notes.append(
+            f"Order reduction and refinement disagree by {100 * apart:.1f} % in {what}; the result of "
+            "the order reduction is kept. A mode was missed, or a coupling is not between last masses?"
+        )
+        return reduced, notes
+    return fitted.model, notes
+
+
+def _friction_seen(model: MachineModel) -> bool:
+    return any(
+        axis.viscous_friction.value > SIGNIFICANT * axis.viscous_friction.std for axis in model.axes
     )
-    return replace(model, axes=axes), [u.reason for u in fitted.unknown if "damper" in u.reason]
+
+
+def without_friction(model: MachineModel) -> MachineModel:
+    """Return the model with no friction at its motors."""
+    axes = tuple(replace(axis, viscous_friction=Estimate(0.0)) for axis in model.axes)
+    return replace(model, axes=axes)
+
+
+def _largest_difference(a: MachineModel, b: MachineModel) -> tuple[float, str]:
+    """Return the largest relative difference of masses and springs, and where it is."""
+    worst, where = 0.0, "nothing"
+    for one, other in zip(a.axes, b.axes, strict=True):
+        for what, first, second in (
+            ("mass", one.masses, other.masses),
+            ("spring", one.springs, other.springs),
+        ):
+            for k, (x, y) in enumerate(zip(first, second, strict=True)):
+                apart = abs(x.value / y.value - 1)
+                if apart > worst:
+                    worst, where = apart, f"{one.name} {what} {k + 1}"
+    return worst, where

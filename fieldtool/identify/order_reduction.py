@@ -93,7 +93,8 @@ class ReducedChain:
     springs: FloatArray
     """Shape (N - 1,), N/m or N m/rad."""
     steps: tuple[LanczosStep, ...]
-    """The steps that removed two masses each, or one each with a known motor mass."""
+    """The steps that removed two masses each, or one each with a known motor mass; a last single
+    spring needs B11 alone and has none."""
     sensitivity: ChainSensitivity
     """Derivatives of (masses, springs) by everything that was given, and rounding."""
 
@@ -160,7 +161,7 @@ def _rows(modes: AxisModes) -> tuple[FloatArray, FloatArray, tuple[LanczosStep, 
     off: list[float] = []
     steps: list[LanczosStep] = []
     try:
-        while len(diagonal) < rows:
+        while rows - len(diagonal) > 1:
             step = lanczos_step(lam, start, done)
             steps.append(step)
             diagonal += [step.b11, step.b22][:at_a_time]
@@ -176,7 +177,10 @@ def _rows(modes: AxisModes) -> tuple[FloatArray, FloatArray, tuple[LanczosStep, 
             f"axis {modes.spectrum.axis}: {error}, but the chain is to have {modes.masses}; the "
             "modes beyond are not seen by this motor: describe the axis with fewer masses"
         ) from error
-    return np.array(diagonal[:rows]), np.array(off[: max(rows - 1, 0)]), tuple(steps)
+    if len(diagonal) < rows:  # the last spring needs B_kk alone
+        last = start / np.linalg.norm(start)
+        diagonal.append(float(last @ (lam * last)))
+    return np.array(diagonal), np.array(off), tuple(steps)
 
 
 def _read_chain(
