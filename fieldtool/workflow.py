@@ -44,6 +44,7 @@ from fieldtool.records.recording import (
 )
 from fieldtool.records.session_folder import SessionFolder
 from fieldtool.records.yaml_file import write_yaml
+from fieldtool.report.pictures import draw_responses
 from fieldtool.writeback.transaction import WriteBack, apply, changes_for, take_backup, undo
 
 PlanName = Literal["classic"]
@@ -239,7 +240,7 @@ def identify(
         prior, motors = prior_model(machine), data_sheet_masses(machine, options)
     identified = identify_recording(recording, masses or {}, prior, motors)
     if folder:
-        _keep(folder, identified)
+        _keep(folder, identified, prior)
     return identified
 
 
@@ -469,13 +470,14 @@ def _identify(session: _Session, options: Options) -> Identified:
     )
     for note in identified.notes:
         session.warn(note)
-    _keep(session.folder, identified)
+    _keep(session.folder, identified, prior_model(machine))
     return identified
 
 
-def _keep(folder: SessionFolder, identified: Identified) -> None:
+def _keep(folder: SessionFolder, identified: Identified, prior: MachineModel | None) -> None:
     save_responses(identified.responses, folder.frequency_response)
     write_model(identified.model, folder.model)
+    draw_responses(identified.responses, identified.model, prior, folder.picture)
     folder.note("identified", notes=list(identified.notes))
 
 

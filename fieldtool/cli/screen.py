@@ -162,6 +162,25 @@ def model_table(model: MachineModel, truth: MachineModel | None) -> Table:
                 _row(
                     table, axis.name, f"{what} {j + 1}", value, UNITS[axis.kind][what], true, truth
                 )
+        for what, friction in (
+            ("viscous friction, motor", axis.viscous_friction),
+            ("viscous friction, load", axis.load_friction),
+        ):
+            if friction.value != 0.0:
+                true_friction = None
+                if true_axis is not None:
+                    true_friction = (
+                        true_axis.load_friction if "load" in what else true_axis.viscous_friction
+                    )
+                _row(
+                    table,
+                    axis.name,
+                    what,
+                    friction,
+                    UNITS[axis.kind]["damper"],
+                    true_friction,
+                    truth,
+                )
     true_couplings: Mapping[tuple[str, ...], float] = (
         {tuple(sorted(c.axes)): c.value for c in truth.couplings} if truth else {}
     )

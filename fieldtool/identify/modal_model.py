@@ -4,9 +4,12 @@
     N_r(s) = P_r + Q_r (s + zeta_r w_r) / (w_r sqrt(1 - zeta_r**2))
     P_r = phi_r phi_r' - chi_r chi_r',    Q_r = phi_r chi_r' + chi_r phi_r'
 
-with s = jw, times exp(-jw d_j) for each torque.  chi is 0 where dampers are proportional to springs
-(all masses pass their rest position together); otherwise it is small, and phi and w are those
-of the undamped machine up to its square.
+with s = jw, times exp(-jw d_j) for each torque.  chi is 0 where dampers are proportional to
+springs (all masses pass their rest position together); otherwise it is small, and phi and w are
+those of the undamped machine up to its square.
+
+Motor friction couples vibration to the rigid body: to first order it takes X / s from G, with
+X = R0 F Y + Y F R0 and Y = sum_r phi_r phi_r' / w_r**2, and makes sum_r Q_r / w_r = X.
 """
 
 from dataclasses import dataclass
@@ -123,7 +126,7 @@ class ModalModel:
 
         Below about 5 a mode may be nothing but noise: the fit always finds as many as it is told.
         """
-        std = self.std("phi")
+        std = self.std("phi").reshape(self.phi.shape)
         ratios = np.divide(np.abs(self.phi), std, out=np.full(std.shape, np.inf), where=std > 0.0)
         return np.asarray(ratios.max(axis=0, initial=0.0), dtype=np.float64)
 
@@ -179,13 +182,43 @@ def modal_response(parts: ModalParts, x: FloatArray, omega: FloatArray) -> Compl
     flexible = np.einsum("fr,ijr->fij", shape.inverse, shape.in_phase) + np.einsum(
         "fr,ijr->fij", shape.inverse * shape.swing, shape.out_of_phase
     )
-    response: ComplexArray = (_rigid(v, omega) + flexible) * np.exp(-s * v.delays)[:, None, :]
-    return response
+    response: ComplexArray = _rigid(v, omega) + flexible
+    if parts.general and parts.friction:
+        response = response - friction_share(v) / s[:, :, None]
+    return response * np.exp(-s * v.delays)[:, None, :]
 
 
 def _root(zeta: FloatArray) -> FloatArray:
     """Damped over undamped frequency; held away from 0 while a fit strays there."""
     return np.sqrt(np.maximum(1.0 - zeta**2, 0.1))
+
+
+def friction_share(v: ModalValues) -> FloatArray:
+    """X = R0 F Y + Y F R0, what friction at the motors passes between rigid body and modes, (M, M)."""
+    half = (v.rigid * v.friction) @ ((v.phi / v.omega**2) @ v.phi.T)
+    return np.asarray(half + half.T, dtype=np.float64)
+
+
+def friction_share_derivatives(parts: ModalParts, v: ModalValues) -> FloatArray:
+    """Derivatives of :func:`friction_share` by every parameter, shape (M, M, P)."""
+    at, axes = parts.slices, parts.axes
+    left = v.rigid * v.friction  # R0 F
+    compliance = (v.phi / v.omega**2) @ v.phi.T
+    half = np.zeros((axes, axes, parts.count))
+    for r in range(parts.modes):
+        shape = v.phi[:, r]
+        half[:, :, at["omega"].start + r] = -2.0 / v.omega[r] ** 3 * np.outer(left @ shape, shape)
+        for a in range(axes):
+            column = at["phi"].start + a * parts.modes + r
+            half[:, :, column] += np.outer(left[:, a], shape) / v.omega[r] ** 2
+            half[:, a, column] += left @ shape / v.omega[r] ** 2
+    for k, (i, j) in enumerate(zip(*parts.upper, strict=True)):
+        half[i, :, at["rigid"].start + k] += v.friction[j] * compliance[j]
+        if i != j:
+            half[j, :, at["rigid"].start + k] += v.friction[i] * compliance[i]
+    for a in range(axes):
+        half[:, :, at["friction"].start + a] = np.outer(v.rigid[:, a], compliance[a])
+    return np.asarray(half + half.transpose(1, 0, 2), dtype=np.float64)
 
 
 class _ModeShapes:
@@ -219,6 +252,8 @@ def modal_derivatives(parts: ModalParts, x: FloatArray, omega: FloatArray) -> Co
     _by_poles(derivatives, parts, v, s, shape)
     _by_shapes(derivatives, parts, v, shape)
     _by_rigid(derivatives, parts, v, omega)
+    if parts.general and parts.friction:
+        derivatives -= friction_share_derivatives(parts, v) / s[:, :, None, None]
     derivatives *= np.exp(-s * v.delays)[:, None, :, None]
     if parts.delay:
         response = modal_response(parts, x, omega)

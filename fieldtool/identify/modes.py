@@ -16,11 +16,11 @@ from fieldtool.identify.least_squares import Fit, fit
 from fieldtool.identify.modal_model import (
     ModalModel,
     ModalParts,
-    ModalValues,
     modal_derivatives,
     modal_response,
     take_apart,
 )
+from fieldtool.identify.modal_sum_rule import sum_rule, sum_rule_jacobian
 from fieldtool.identify.pole_search import Poles, Responses, find_poles, start_poles
 from fieldtool.identify.response_data import ResponseMatrix
 from fieldtool.records.model import MachineModel
@@ -240,11 +240,11 @@ def _fit_from(
 ) -> Fit:
     def residuals(x: FloatArray, floor: float) -> FloatArray:
         response = modal_response(parts, x, data.omega)
-        return np.concatenate([data.residuals(response, floor), _sum_rule(parts, x)])
+        return np.concatenate([data.residuals(response, floor), sum_rule(parts, x)])
 
     def jacobian(x: FloatArray, floor: float) -> FloatArray:
         derivatives = modal_derivatives(parts, x, data.omega)
-        return np.vstack([data.jacobian(derivatives, floor), _sum_rule_jacobian(parts, x)])
+        return np.vstack([data.jacobian(derivatives, floor), sum_rule_jacobian(parts, x)])
 
     return fit(residuals, jacobian, start, floors, evaluations)
 
@@ -262,40 +262,6 @@ def _rank_one(residue: FloatArray, pairs: NDArray[np.bool_]) -> FloatArray:
     else:
         shape = np.sqrt(np.abs(residue).max(axis=1))
     return shape
-
-
-def _sum_rule(parts: ModalParts, x: FloatArray) -> FloatArray:
-    """A push at rest starts no velocity: sum_r Q_r / w_r = 0, to 0.1 %, as further measurements."""
-    if not parts.general:
-        return np.zeros(0)
-    v = take_apart(parts, x)
-    i, j = parts.upper
-    products = v.phi[i] * v.chi[j] + v.chi[i] * v.phi[j]
-    return np.asarray((products / v.omega).sum(axis=1)) / _sum_rule_sizes(parts, v)
-
-
-def _sum_rule_sizes(parts: ModalParts, v: ModalValues) -> FloatArray:
-    sizes = np.sqrt((v.phi**2 / v.omega).sum(axis=1))
-    i, j = parts.upper
-    return np.asarray(1e-3 * np.maximum(sizes[i] * sizes[j], 1e-300))
-
-
-def _sum_rule_jacobian(parts: ModalParts, x: FloatArray) -> FloatArray:
-    """Derivatives of :func:`_sum_rule`; its size is taken as fixed."""
-    if not parts.general:
-        return np.zeros((0, parts.count))
-    v = take_apart(parts, x)
-    i, j = parts.upper
-    rows = np.zeros((i.size, parts.count))
-    phi, chi = parts.slices["phi"].start, parts.slices["chi"].start
-    each = np.arange(parts.modes)
-    for k, (a, b) in enumerate(zip(i, j, strict=True)):
-        rows[k, each] = -(v.phi[a] * v.chi[b] + v.chi[a] * v.phi[b]) / v.omega**2
-        for c, d in ((a, b), (b, a)):
-            rows[k, phi + c * parts.modes + each] += v.chi[d] / v.omega
-            rows[k, chi + c * parts.modes + each] += v.phi[d] / v.omega
-    result: FloatArray = rows / _sum_rule_sizes(parts, v)[:, None]
-    return result
 
 
 def _first_delays(data: ResponseMatrix) -> FloatArray:

@@ -9,7 +9,13 @@ from scipy.linalg import eigh
 from fieldtool.errors import NotEnoughDataError
 from fieldtool.identify.forward import spectra
 from fieldtool.identify.modal_chain import reduce_modes, reduction_inputs
-from fieldtool.identify.modal_model import ModalParts, modal_derivatives, modal_response
+from fieldtool.identify.modal_model import (
+    ModalParts,
+    modal_derivatives,
+    modal_response,
+    take_apart,
+)
+from fieldtool.identify.modal_sum_rule import sum_rule, sum_rule_jacobian
 from fieldtool.identify.modes import fit_modes
 from fieldtool.identify.pole_search import Responses, find_poles, start_poles
 from fieldtool.identify.refine import machine_response
@@ -89,9 +95,14 @@ def test_standard_errors_are_honest(rng):
         modal = fit_modes(measure(truth, omega, 5e-3, rng), 6, general=False)
         model = reduce_modes(modal, LENGTHS).model
         for found, true in zip(model.axes, truth.axes, strict=True):
-            for e, t in zip((*found.masses, *found.springs), (*true.masses, *true.springs)):
+            for e, t in zip(
+                (*found.masses, *found.springs), (*true.masses, *true.springs), strict=True
+            ):
                 misses.append((e.value - t.value) / e.std)
-        misses += [(c.value - t.value) / c.std for c, t in zip(model.couplings, truth.couplings)]
+        misses += [
+            (c.value - t.value) / c.std
+            for c, t in zip(model.couplings, truth.couplings, strict=True)
+        ]
     assert 0.6 < np.sqrt(np.mean(np.square(misses))) < 1.6
 
 
@@ -235,6 +246,26 @@ def test_derivatives_agree_with_differences(friction, rng):
         np.testing.assert_allclose(
             derivatives[..., k], slope, atol=1e-5 * np.abs(slope).max(), rtol=1e-5
         )
+
+
+@pytest.mark.parametrize("friction", [False, True])
+def test_sum_rule_derivatives_agree_with_differences(friction, rng):
+    parts = ModalParts(3, np.ones((2, 2), bool), True, friction, False)
+    x = rng.uniform(0.1, 1.0, parts.count)
+    x[parts.slices["zeta"]] *= 0.3
+    rows = sum_rule_jacobian(parts, x)
+    for k in range(x.size):
+        step = 1e-6 * np.eye(x.size)[k]
+        up, down = (sum_rule(parts, x + s) * _scale(parts, x + s) for s in (step, -step))
+        np.testing.assert_allclose(
+            rows[:, k] * _scale(parts, x), (up - down) / 2e-6, rtol=1e-5, atol=1e-7
+        )
+
+
+def _scale(parts, x):
+    v = take_apart(parts, x)
+    size = np.sqrt((v.phi**2 / v.omega).sum(axis=1))
+    return 1e-3 * np.array([size[0] ** 2, size[0] * size[1], size[1] ** 2])
 
 
 def test_poles_are_found_exactly_without_noise():

@@ -130,7 +130,7 @@ def test_lanczos_vectors_stay_orthogonal(rng):
 @pytest.mark.parametrize("known", [False, True])
 def test_derivatives_agree_with_differences(known, rng):
     model = exact_modes.random_machine(rng, 2, [4, 3])
-    axes, cross = bench.machine_inputs(model, spectra(model), known)
+    axes, _ = bench.machine_inputs(model, spectra(model), known)
     chain = reduce_chain(axes[0])
     modes = axes[0]
     lam, lam0 = modes.spectrum.resonances[1:], modes.spectrum.antiresonances
