@@ -237,7 +237,7 @@ def identify(
     console = _console(as_json)
     options = _options("classic", False, False, motor_inertia)
     found = workflow.identify(source, options, _lengths(masses or []))
-    console.print(model_table(found.model, None))
+    console.print(model_table(found.model, None, found.torque_units))
     if found.chain is not None:
         for line in found.chain.sentences:
             console.print(f"  {line}")

@@ -14,7 +14,7 @@ from rich.text import Text
 from fieldtool.experiment.forecast import AxisForecast
 from fieldtool.experiment.plan import SweepPlan
 from fieldtool.experiment.runner import Progress
-from fieldtool.records.model import Estimate, MachineModel
+from fieldtool.records.model import Estimate, Kind, MachineModel
 from fieldtool.workflow import SessionResult
 
 UNITS = {
@@ -139,8 +139,35 @@ def _clock(seconds: float) -> str:
     return f"{minutes}:{rest:02d} min"
 
 
-def model_table(model: MachineModel, truth: MachineModel | None) -> Table:
-    """Return masses, springs, dampers and couplings with their 95 % intervals."""
+def units_of(kind: Kind, torque_unit: str) -> dict[str, str]:
+    """Return the units of masses, springs and dampers for a torque in N m, N, or A (motor current)."""
+    if torque_unit != "A":
+        return UNITS[kind]
+    position = UNITS[kind]["position"]
+    return {
+        "mass": f"A s2/{position}",
+        "spring": f"A/{position}",
+        "damper": f"A s/{position}",
+        "position": position,
+    }
+
+
+def model_table(
+    model: MachineModel, truth: MachineModel | None, torque_units: Sequence[str] = ()
+) -> Table:
+    """Return masses, springs, dampers and couplings with their 95 % intervals.
+
+    Parameters
+    ----------
+    model, truth
+        Identified model, and what a simulated machine really is.
+    torque_units
+        One an axis; N m or N where left out.
+    """
+    units = [
+        units_of(axis.kind, torque_units[k] if torque_units else "")
+        for k, axis in enumerate(model.axes)
+    ]
     table = Table(box=None, padding=(0, 2))
     for title in ("axis", "what", "value", "± (95 %)", "unit"):
         table.add_column(title, justify="left" if title in ("axis", "what", "unit") else "right")
@@ -191,7 +218,7 @@ def model_table(model: MachineModel, truth: MachineModel | None) -> Table:
             " - ".join(c.axes),
             "coupling",
             Estimate(c.value, c.std),
-            UNITS[model.axes[0].kind]["mass"],
+            units[0]["mass"],
             Estimate(true_value) if true_value is not None else None,
             truth,
         )

@@ -7,7 +7,7 @@ the weak ones decide alone, and the standard errors are honest.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import eig, eigh
@@ -18,11 +18,14 @@ from fieldtool.frf.multisine import analyse_multisine
 from fieldtool.frf.response import FrequencyResponse
 from fieldtool.identify.modal_chain import reduce_modes
 from fieldtool.identify.modes import fit_modes
+from fieldtool.identify.parameters import machine_parameters, parameter_values, with_values
 from fieldtool.identify.refine import RefinedModel, refine
 from fieldtool.identify.response_data import ResponseMatrix
 from fieldtool.records.model import Estimate, FloatArray, MachineModel
 from fieldtool.records.recording import Recording
 
+START_SHARE = 0.05
+"""Of the response: model error reckoned with while start values are sought."""
 SHARES = (0.0, 0.003, 0.01, 0.02, 0.03, 0.05, 0.1)
 """Of the response: model errors to try, the smallest that explains the misfit is taken."""
 STEP = 1e-5
@@ -116,7 +119,7 @@ def _matrix(response: FrequencyResponse, share: float) -> ResponseMatrix:
 
 
 def _start(response: FrequencyResponse, masses: int, recording: Recording) -> MachineModel:
-    modal = fit_modes(_matrix(response, SHARES[-1]), masses - 1, fit_friction=True, fit_delay=True)
+    modal = fit_modes(_matrix(response, START_SHARE), masses - 1, fit_friction=True, fit_delay=True)
     name, kind = response.axes[0], recording.axes[0].kind
     return reduce_modes(modal, {name: masses}, {name: kind}).model
 
@@ -125,9 +128,15 @@ def _fitted(response: FrequencyResponse, start: MachineModel) -> tuple[float, Re
     """Return the smallest model error that explains the misfit, and the fit with it."""
     best: tuple[float, RefinedModel] | None = None
     for share in SHARES:
-        found = refine(start, _matrix(response, share), fit_delay=True, fit_friction=True)
+        found = refine(
+            start,
+            _matrix(response, share),
+            fit_delay=True,
+            fit_friction=True,
+            fit_load_friction=True,
+        )
         best = (share, found)
-        start = replace(found.model)
+        start = found.model
         if found.chi2 <= found.degrees_of_freedom:
             break
     if best is None:

@@ -167,7 +167,7 @@ def _high_gain(modal: ModalModel, axis: int) -> tuple[float, FloatArray]:
 
 def _mass_derivatives(modal: ModalModel) -> tuple[FloatArray, FloatArray]:
     """inv(R0), shape (M, M), and its derivatives, shape (M, M, P)."""
-    mass = np.linalg.inv(modal.rigid)
+    mass: FloatArray = np.asarray(np.linalg.inv(modal.rigid), dtype=np.float64)
     moved = np.zeros((*mass.shape, modal.parts.count))
     for i, j in zip(*modal.parts.upper, strict=True):
         change = np.outer(mass[:, i], mass[j])

@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 from fieldtool.records.model import AxisModel, Estimate, MachineModel
 
 FloatArray = NDArray[np.float64]
-ParameterKind = Literal["mass", "spring", "damper", "viscous_friction", "delay", "coupling"]
+ParameterKind = Literal[
+    "mass", "spring", "damper", "viscous_friction", "load_friction", "delay", "coupling"
+]
 
 
 @dataclass(frozen=True)
@@ -20,7 +22,7 @@ class Parameter:
 
     name: str
     """``x.mass[1]``, ``x.spring[1]``, ``x.damper[1]`` (motor side first), ``x.viscous_friction``,
-    ``x.delay``, ``coupling[x,y]``."""
+    ``x.load_friction``, ``x.delay``, ``coupling[x,y]``."""
     kind: ParameterKind
     dofs: tuple[int, ...]
     """Degrees of freedom it acts on; the axis' number for a delay."""
@@ -66,6 +68,11 @@ def machine_parameters(model: MachineModel, omega: FloatArray) -> tuple[Paramete
         friction = axis.total_mass * float(omega.min())
         name = f"{axis.name}.viscous_friction"
         listed.append(Parameter(name, "viscous_friction", (a,), i, 0, friction))
+        if len(axis.masses) > 1:  # of a rigid axis both frictions are one
+            end = (a + len(axis.masses) - 1,)
+            listed.append(
+                Parameter(f"{axis.name}.load_friction", "load_friction", end, i, 0, friction)
+            )
         listed.append(
             Parameter(f"{axis.name}.delay", "delay", (i,), i, 0, 1.0 / float(omega.max()))
         )
@@ -102,6 +109,8 @@ def _value(model: MachineModel, p: Parameter, delays: Sequence[float]) -> float:
     axis = model.axes[p.axis]
     if p.kind == "viscous_friction":
         return axis.viscous_friction.value
+    if p.kind == "load_friction":
+        return axis.load_friction.value
     chain = {"mass": axis.masses, "spring": axis.springs, "damper": axis.dampers}
     return chain[p.kind][p.index].value
 
@@ -131,6 +140,7 @@ def with_values(
             of(i, "spring"),
             of(i, "damper"),
             of(i, "viscous_friction")[0],
+            next(iter(of(i, "load_friction")), axis.load_friction),
         )
         for i, axis in enumerate(model.axes)
     )

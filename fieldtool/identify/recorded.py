@@ -25,6 +25,8 @@ class Identified:
     damping_ratios: FloatArray
     """Of the resonances, rising frequency, shape (n,)."""
     notes: tuple[str, ...]
+    torque_units: tuple[str, ...]
+    """Of each axis' torque: N m, N, or A where only the motor current is known."""
     chain: ChainResult | None = None
     """Features of a single elastic axis."""
 
@@ -70,6 +72,7 @@ def identify_recording(
         )
     known = {name: count for name, count in lengths.items() if count is not None}
     kinds = {axis.name: axis.kind for axis in recording.axes}
+    units = tuple(axis.torque_unit for axis in recording.axes)
     kinds_of_data = {e.kind for e in recording.experiments if e.segments or e.period}
     if "stepped_sine" in kinds_of_data:
         stepped = stepped_responses(recording)
@@ -80,6 +83,7 @@ def identify_recording(
             stepped.responses,
             found.damping_ratios,
             found.notes,
+            units,
         )
     if len(recording.axes) == 1 and "multisine" in kinds_of_data:
         chain = identify_chain(recording, known[recording.names[0]])
@@ -89,6 +93,7 @@ def identify_recording(
             {chain.response.condition: chain.response},
             np.array([ratio.value for ratio in chain.damping_ratios]),
             chain.notes,
+            units,
             chain,
         )
     raise NotEnoughDataError(

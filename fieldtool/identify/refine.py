@@ -101,6 +101,7 @@ def refine(
     priors: Mapping[str, Estimate] | None = None,
     fit_delay: bool = False,
     fit_friction: bool = False,
+    fit_load_friction: bool = False,
     delays: Collection[float] | None = None,
 ) -> RefinedModel:
     """Fit a machine's parameters to frequency responses.
@@ -117,8 +118,9 @@ def refine(
     priors : mapping of name to Estimate, optional
         What is known besides, counted as one more measurement each (log-normal for masses, springs
         and dampers).
-    fit_delay, fit_friction : bool
-        Whether delays and viscous friction at the motors are fitted, or keep their start.
+    fit_delay, fit_friction, fit_load_friction : bool
+        Whether delays, viscous friction at the motors, and at the last masses are fitted, or keep
+        their start.
     delays : one number per axis, optional
         Start, s; zero otherwise.
 
@@ -133,9 +135,13 @@ def refine(
     """
     if data.names != start.names:
         raise ValueError(f"the data have axes {data.names}, the model has {start.names}")
-    problem = _Problem.build(
-        start, data, set(fixed), dict(priors or {}), fit_delay, fit_friction, delays
-    )
+    fitted = {
+        "delay": fit_delay,
+        "viscous_friction": fit_friction,
+        "load_friction": fit_load_friction,
+    }
+    kept = {kind for kind, wanted in fitted.items() if not wanted}
+    problem = _Problem.build(start, data, set(fixed), dict(priors or {}), kept, delays)
     if data.count + len(problem.priors) < len(problem.free):
         raise NotEnoughDataError(
             f"{data.count} measured numbers can not give {len(problem.free)} parameters; "
@@ -164,8 +170,7 @@ class _Problem:
         data: ResponseMatrix,
         fixed: set[str],
         priors: dict[str, Estimate],
-        fit_delay: bool,
-        fit_friction: bool,
+        kept_kinds: set[str],
         delays: Collection[float] | None,
     ) -> "_Problem":
         start = _with_dampers(start)
@@ -174,12 +179,7 @@ class _Problem:
         for name in (*fixed, *priors):
             if name not in names:
                 raise ValueError(f"no parameter {name!r}; there are {', '.join(names)}")
-        kept = fixed | {
-            p.name
-            for p in parameters
-            if (p.kind == "delay" and not fit_delay)
-            or (p.kind == "viscous_friction" and not fit_friction)
-        }
+        kept = fixed | {p.name for p in parameters if p.kind in kept_kinds}
         free = np.array([k for k, n in enumerate(names) if n not in kept], dtype=np.intp)
         initial = parameter_values(start, parameters, list(delays or [0.0] * len(start.axes)))
         known = tuple(
@@ -289,7 +289,11 @@ class _Problem:
 def _open(parameter: Parameter, value: float, std: float) -> Unknown | None:
     """Say what one badly known parameter means."""
     relative = std / abs(value) if value else inf
-    if relative <= UNKNOWN_ABOVE or parameter.kind in ("delay", "viscous_friction"):
+    if relative <= UNKNOWN_ABOVE or parameter.kind in (
+        "delay",
+        "viscous_friction",
+        "load_friction",
+    ):
         return None
     if parameter.kind == "coupling":
         reason = f"{parameter.name} can not be told from none: {value:.3g} +- {std:.2g}"
