@@ -54,9 +54,9 @@ class ObjectAddress:
         ValueError
             If the text is no such address.
         """
-        index_text, _, sub_text = text.partition(":")
+        index_text, colon, sub_text = text.partition(":")
         try:
-            index, sub = int(index_text, 16), int(sub_text, 16) if sub_text else 0
+            index, sub = int(index_text, 16), int(sub_text, 16) if colon else 0
         except ValueError:
             raise ValueError(
                 f"{text!r} is no object address; write it as 0x2010:01 (hexadecimal)"
@@ -98,16 +98,17 @@ def encode(data_type: DataType, value: float | str) -> bytes:
         If the value does not fit the type: out of range, not whole, or not finite.
     """
     if data_type == "VISIBLE_STRING":
-        return str(value).encode("ascii")
+        try:
+            return str(value).encode("ascii")
+        except UnicodeEncodeError:
+            raise ValueError(f"{data_type} needs plain ASCII, got {value!r}") from None
     if isinstance(value, str):
         raise ValueError(f"{data_type} needs a number, got {value!r}")  # noqa: TRY004
     number: int | float = value
-    if data_type.startswith("REAL"):
-        number = float(value)
-        if not isfinite(number):
-            raise ValueError(f"{data_type} needs a finite number, got {value!r}")
-    else:
-        if not isfinite(value) or value != int(value):
+    if isinstance(value, float) and not isfinite(value):
+        raise ValueError(f"{data_type} needs a finite number, got {value!r}")
+    if not data_type.startswith("REAL"):
+        if value != int(value):
             raise ValueError(f"{data_type} needs a whole number, got {value!r}")
         number = int(value)
         low, high = type_range(data_type)
@@ -139,9 +140,17 @@ def decode(data_type: DataType, data: bytes) -> int | float | str:
 
 
 def type_range(data_type: DataType) -> tuple[int, int]:
-    """Return the smallest and the largest value of a whole-number type."""
+    """Return the smallest and the largest value of a whole-number type.
+
+    Raises
+    ------
+    ValueError
+        If it is none.
+    """
     if data_type == "BOOLEAN":
         return 0, 1
+    if not data_type.startswith(("INTEGER", "UNSIGNED")):
+        raise ValueError(f"{data_type} is no whole-number type")
     bits = type_bits(data_type)
     if data_type.startswith("UNSIGNED"):
         return 0, 2**bits - 1
@@ -149,7 +158,15 @@ def type_range(data_type: DataType) -> tuple[int, int]:
 
 
 def type_bits(data_type: DataType) -> int:
-    """Return the number of bits that a fixed-length type takes in a PDO."""
+    """Return the number of bits that a fixed-length type takes in a PDO.
+
+    Raises
+    ------
+    ValueError
+        If the type has no fixed length, as texts have none.
+    """
+    if data_type not in _LAYOUT:
+        raise ValueError(f"{data_type} has no fixed length")
     return 8 * struct.calcsize(_LAYOUT[data_type])
 
 

@@ -5,7 +5,7 @@ Inside everything is SI: rad, rad/s, N m on rotary axes; m, m/s, N on linear one
 
 import re
 from dataclasses import dataclass
-from math import pi
+from math import isfinite, pi
 from typing import Literal
 
 Kind = Literal["rotary", "linear"]
@@ -31,7 +31,8 @@ UNITS: dict[str, dict[str, float]] = {
 }
 """Dimension: unit and its value in SI."""
 
-_QUANTITY = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(\S.*?)\s*")
+_QUANTITY = re.compile(r"\s*([-+]?(?:\d++\.?+\d*+|\.\d++)(?:[eE][-+]?\d++)?+)\s*+(\S.*?)\s*")
+"""Number and unit; possessive, so that no digit of a bare number is taken for its unit."""
 
 
 def parse_quantity(text: object, *dimensions: str) -> float:
@@ -47,7 +48,7 @@ def parse_quantity(text: object, *dimensions: str) -> float:
     Raises
     ------
     ValueError
-        If there is no number, no unit, or a unit of another dimension.
+        If there is no number, no unit, a unit of another dimension, or a number too large.
     """
     known = {unit: factor for d in dimensions for unit, factor in UNITS[d].items()}
     wanted = f"a number with one of the units {', '.join(known)}"
@@ -61,7 +62,10 @@ def parse_quantity(text: object, *dimensions: str) -> float:
     unit = {"Nm": "N m", "mNm": "mN m", "kNm": "kN m", "kgm2": "kg m2"}.get(unit, unit)
     if unit not in known:
         raise ValueError(f"unit {unit!r} does not fit: needs {wanted}")
-    return float(number) * known[unit]
+    value = float(number) * known[unit]
+    if not isfinite(value):
+        raise ValueError(f"{text!r} is too large for a number; needs {wanted}")
+    return value
 
 
 @dataclass(frozen=True)

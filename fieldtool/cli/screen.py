@@ -186,9 +186,7 @@ def model_table(
                 getattr(true_axis, plural) if true_axis else [None] * len(values)
             )
             for j, (value, true) in enumerate(zip(values, known, strict=False)):
-                _row(
-                    table, axis.name, f"{what} {j + 1}", value, UNITS[axis.kind][what], true, truth
-                )
+                _row(table, axis.name, f"{what} {j + 1}", value, units[k][what], true, truth)
         for what, friction in (
             ("viscous friction, motor", axis.viscous_friction),
             ("viscous friction, load", axis.load_friction),
@@ -204,7 +202,7 @@ def model_table(
                     axis.name,
                     what,
                     friction,
-                    UNITS[axis.kind]["damper"],
+                    units[k]["damper"],
                     true_friction,
                     truth,
                 )

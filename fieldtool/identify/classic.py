@@ -110,7 +110,7 @@ def identify_classic(
     modal = fit_modes(
         data,
         sum(masses[name] - 1 for name in free.axes),
-        fit_friction=data.pairs.all() and bool(np.all(data.measured.any(axis=0))),
+        fit_friction=bool(data.pairs.all() and np.all(data.measured.any(axis=0))),
         prior=prior,
     )
     inputs = reduction_inputs(modal, masses, kinds, motor_masses)
@@ -167,14 +167,14 @@ def held_gains(
         )
     solved = solved_response(held)
     omega2 = (2 * np.pi * solved.frequencies) ** 2
-    stiffness = np.linalg.inv(solved.response)
+    stiffness = np.linalg.inv(solved.response).astype(np.complex128)
     size = np.abs(stiffness) ** 2
     stiffness_std = np.sqrt(size @ solved.std**2 @ size)  # dZ = -Z dG Z, elements independent
     low = []
     for k in range(len(axes)):
         found = dynamic_stiffness_low(
             solved.frequencies,
-            1 / stiffness[:, k, k],
+            np.reciprocal(stiffness[:, k, k]),
             np.ones(omega2.size, dtype=np.complex128),
             stiffness_std[:, k, k] / np.abs(stiffness[:, k, k]) ** 2,
         )
@@ -184,7 +184,7 @@ def held_gains(
     cross = []
     for i, j in combinations(range(len(axes)), 2):
         pair = np.ix_(range(omega2.size), [i, j], [i, j])
-        inverse = np.linalg.inv(apparent[pair])
+        inverse = np.linalg.inv(apparent[pair]).astype(np.float64)
         spread = inverse**2
         std = np.sqrt(spread @ apparent_std[pair] ** 2 @ spread)
         cross.append(

@@ -1,0 +1,60 @@
+"""Seeds that vary from run to run and are printed, and random machines to try."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from fieldtool.records.model import AxisModel, Coupling, Estimate, MachineModel
+
+RandomModel = Callable[..., MachineModel]
+
+
+def _random_model(
+    rng: np.random.Generator,
+    lengths: tuple[int, ...],
+    *,
+    damped: bool = True,
+    friction: bool = False,
+    spread: float = 0.3,
+) -> MachineModel:
+    """Chains of these lengths, modes between some 2 and 30 Hz, couplings of both signs."""
+    chains = []
+    for i, n in enumerate(lengths):
+        masses = 2.0 * np.exp(rng.uniform(-spread, spread, n))
+        springs = 8000.0 * np.exp(rng.uniform(-spread, spread, n - 1))
+        dampers = springs * rng.uniform(2e-4, 6e-4, n - 1)
+        chains.append(
+            AxisModel(
+                f"axis{i + 1}",
+                "rotary" if i % 2 == 0 else "linear",
+                tuple(Estimate(float(m)) for m in masses),
+                tuple(Estimate(float(k)) for k in springs),
+                tuple(Estimate(float(d)) for d in dampers) if damped else (),
+                Estimate(float(rng.uniform(0.1, 1.0)) if friction else 0.0),
+                Estimate(float(rng.uniform(0.1, 1.0)) if friction else 0.0),
+            )
+        )
+    couplings = []
+    for i in range(len(lengths)):
+        for j in range(i + 1, len(lengths)):
+            share = rng.uniform(0.15, 0.8) / (len(lengths) - 1) * rng.choice([-1.0, 1.0])
+            ends = chains[i].masses[-1].value * chains[j].masses[-1].value
+            couplings.append(
+                Coupling((chains[i].name, chains[j].name), float(share * np.sqrt(ends)))
+            )
+    return MachineModel(tuple(chains), tuple(couplings))
+
+
+@pytest.fixture(scope="session")
+def random_model() -> RandomModel:
+    """Makes ``random_model(rng, lengths, damped=True, friction=False)``."""
+    return _random_model
+
+
+@pytest.fixture
+def fresh_rng() -> np.random.Generator:
+    """Random numbers of a new seed each run; it is printed, and shown when a test fails."""
+    seed = int(np.random.SeedSequence().generate_state(1)[0])
+    print("seed", seed)
+    return np.random.default_rng(seed)
