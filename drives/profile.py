@@ -122,6 +122,10 @@ class DriveProfile(_Part):
     """0x6007 to set while the machine moves: 1 fault, 2 disable voltage, 3 quick stop."""
     error_behaviour: Literal[0, 1, 2] | None = None
     """0x1029:1 to set while the machine moves; none where the drive has no such object."""
+    interpolation: Literal["linear", "unknown"] = "unknown"
+    """How the drive goes from one cyclic target to the next."""
+    torque_lag: Annotated[float, BeforeValidator(_time), Field(ge=0)] = 0.0
+    """From the drive's reference to the torque that it reports: current loop and inner sampling."""
     interpolation_index: Literal[-6, -5, -4, -3] = -3
     """Exponent of ten that 0x60C2:2 gets."""
     volatile_commands: tuple[Address, ...] = ()

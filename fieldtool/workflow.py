@@ -25,6 +25,7 @@ from fieldtool.experiment.classic import chosen_cycle_time, classic_plan, refine
 from fieldtool.experiment.forecast import AxisForecast, Setting, forecast
 from fieldtool.experiment.plan import SweepPlan
 from fieldtool.experiment.runner import Axes, Progress, check_directions, run_plan
+from fieldtool.frf.held_targets import LINEAR_TARGETS
 from fieldtool.frf.response import save_responses
 from fieldtool.identify.classic import without_friction
 from fieldtool.identify.prediction import LoadPrediction, predict_load
@@ -456,7 +457,15 @@ def _header(machine: MachineProfile, group: CanopenGroup, cycle_time: float) -> 
                 position_unit="rad" if rotary else "m",
             )
         )
-    return Recording(cycle_time, tuple(axes), (), machine.description, {"machine": machine.name})
+    source = {"machine": machine.name}
+    linear = [
+        f"{d.axis}={d.profile.torque_lag!r}"
+        for d in group.drives
+        if d.profile.interpolation == "linear"
+    ]
+    if linear:
+        source[LINEAR_TARGETS] = " ".join(linear)
+    return Recording(cycle_time, tuple(axes), (), machine.description, source)
 
 
 def _identify(session: _Session, options: Options) -> Identified:

@@ -18,8 +18,14 @@ from fieldtool.records.model import Estimate, Kind, MachineModel
 from fieldtool.workflow import SessionResult
 
 UNITS = {
-    "rotary": {"mass": "kg m2", "spring": "N m/rad", "damper": "N m s/rad", "position": "rad"},
-    "linear": {"mass": "kg", "spring": "N/m", "damper": "N s/m", "position": "m"},
+    "rotary": {
+        "mass": "kg m2",
+        "spring": "N m/rad",
+        "damper": "N m s/rad",
+        "position": "rad",
+        "torque": "N m",
+    },
+    "linear": {"mass": "kg", "spring": "N/m", "damper": "N s/m", "position": "m", "torque": "N"},
 }
 
 
@@ -87,10 +93,10 @@ class TerminalScreen:
         for axis in expected:
             peaks.add_row(
                 axis.axis,
-                f"±{axis.excursion:.3g}",
-                f"{axis.velocity:.3g}/s",
-                f"{axis.torque:.3g}",
-                f"{axis.following_error:.3g}",
+                f"±{axis.excursion:.3g} {UNITS[axis.kind]['position']}",
+                f"{axis.velocity:.3g} {UNITS[axis.kind]['position']}/s",
+                f"{axis.torque:.3g} {UNITS[axis.kind]['torque']}",
+                f"{axis.following_error:.3g} {UNITS[axis.kind]['position']}",
             )
         self.console.print(peaks)
         self.console.print(

@@ -9,7 +9,7 @@ from drives.api import AxisLimits
 from fieldtool.errors import PlanRefusedError
 from fieldtool.experiment.plan import Sweep, SweepPlan, tone_blocks, transition
 from fieldtool.records.closed_loop import AxisLoop, ClosedLoop
-from fieldtool.records.model import FloatArray, MachineModel
+from fieldtool.records.model import FloatArray, Kind, MachineModel
 
 SIMULATED_BLOCKS = 3
 """Blocks of each tone in the simulation; transients have their largest values before that."""
@@ -41,6 +41,7 @@ class AxisForecast:
     """Largest values of one axis in a plan, SI, and the limits they stay below."""
 
     axis: str
+    kind: Kind
     excursion: float
     """From the centre."""
     velocity: float
@@ -64,8 +65,8 @@ def forecast(plan: SweepPlan, setting: Setting) -> tuple[AxisForecast, ...]:
         _check(sweep, found, setting)
         peaks = np.maximum(peaks, found)
     return tuple(
-        AxisForecast(name, *(float(v) for v in peaks[:, k]))
-        for k, name in enumerate(setting.model.names)
+        AxisForecast(axis.name, axis.kind, *(float(v) for v in peaks[:, k]))
+        for k, axis in enumerate(setting.model.axes)
     )
 
 

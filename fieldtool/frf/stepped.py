@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fieldtool.errors import NotEnoughDataError
+from fieldtool.frf.held_targets import folded_torque
 from fieldtool.frf.matrix import column_responses
 from fieldtool.frf.phasors import Phasors, fit_sine
 from fieldtool.frf.quality import SegmentQuality, judge
@@ -70,7 +71,10 @@ def stepped_phasors(
             raise NotEnoughDataError(
                 f"experiment {experiment.name}, rows {segment.start} to {segment.stop}: {error}"
             ) from error
-        amplitudes.append(fit.amplitude)
+        amplitude = fit.amplitude.copy()
+        for axis in driven:
+            amplitude[M + axis] -= folded_torque(recording, experiment, segment, axis)
+        amplitudes.append(amplitude)
         covariances.append(fit.covariance)
         quality.append(judge(experiment.name, fit, time, signals[rows], driven))
     values = np.array(amplitudes, dtype=np.complex128).reshape(-1, 2 * M)

@@ -1,11 +1,13 @@
 """What a two-mass axis shows its motor: antiresonance, resonance, inertia ratio, damping.
 
-Motor inertia m1, load inertia m2, spring k with damper d, viscous friction c at the motor::
+Motor inertia m1, load inertia m2, spring k with damper d, viscous
+friction c at the motor and e at the load::
 
-    antiresonance  w_a = sqrt(k / m2)                zeta_a = d / (2 sqrt(k m2))
-    resonance      w_r = sqrt(k (1/m1 + 1/m2))       zeta_r = (d (1/m1 + 1/m2) + c s) / (2 w_r)
+    antiresonance  w_a = sqrt(k / m2)                zeta_a = (d + e) / (2 sqrt(k m2))
+    resonance      w_r = sqrt(k (1/m1 + 1/m2))       zeta_r = (d (1/m1 + 1/m2) + c s + e t) / (2 w_r)
 
-with s = m2 / (m1 (m1 + m2)), the share of friction that the vibration feels (first order in c).
+with s = m2 / (m1 (m1 + m2)) and t = m1 / (m2 (m1 + m2)), the shares of friction that the vibration
+feels (first order in c and e).
 All but the damping's share of friction hold whatever unit the torque is measured in.
 """
 
@@ -77,11 +79,12 @@ def _named(axes: tuple[AxisModel, ...], name: str) -> AxisModel:
 
 
 def _values(axis: AxisModel) -> tuple[Values, tuple[str, ...]]:
-    """m1, m2, k, d, c and their names."""
+    """m1, m2, k, d, c, e and their names."""
     damper = axis.dampers[0].value if axis.dampers else 0.0
     numbers = [*(m.value for m in axis.masses), axis.springs[0].value, damper]
-    names = ("mass[1]", "mass[2]", "spring[1]", "damper[1]", "viscous_friction")
-    values = np.array([*numbers, axis.viscous_friction.value], dtype=complex)
+    names = ("mass[1]", "mass[2]", "spring[1]", "damper[1]", "viscous_friction", "load_friction")
+    frictions = [axis.viscous_friction.value, axis.load_friction.value]
+    values = np.array([*numbers, *frictions], dtype=complex)
     return values, tuple(f"{axis.name}.{name}" for name in names)
 
 
@@ -98,12 +101,13 @@ def _ratio(v: Values) -> np.complex128:
 
 
 def _antiresonance_damping(v: Values) -> np.complex128:
-    return np.complex128(v[3] / (2.0 * np.sqrt(v[2] * v[1])))
+    return np.complex128((v[3] + v[5]) / (2.0 * np.sqrt(v[2] * v[1])))
 
 
 def _resonance_damping(v: Values) -> np.complex128:
-    share = v[1] / (v[0] * (v[0] + v[1]))
-    damping = v[3] * (1.0 / v[0] + 1.0 / v[1]) + v[4] * share
+    total = v[0] + v[1]
+    frictions = v[4] * v[1] / (v[0] * total) + v[5] * v[0] / (v[1] * total)
+    damping = v[3] * (1.0 / v[0] + 1.0 / v[1]) + frictions
     return np.complex128(damping / (2.0 * np.sqrt(v[2] * (1.0 / v[0] + 1.0 / v[1]))))
 
 

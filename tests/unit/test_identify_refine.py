@@ -24,7 +24,7 @@ def estimates(values):
     return tuple(Estimate(float(v)) for v in values)
 
 
-def axis(name, masses, springs, dampers=(), friction=0.0):
+def axis(name, masses, springs, dampers=(), friction=0.0, load_friction=0.0):
     return AxisModel(
         name,
         "rotary",
@@ -32,14 +32,15 @@ def axis(name, masses, springs, dampers=(), friction=0.0):
         estimates(springs),
         estimates(dampers),
         Estimate(friction),
+        Estimate(load_friction),
     )
 
 
 def two_axes():
     return MachineModel(
         (
-            axis("x", [1.0, 2.0, 1.5], [3000.0, 5000.0], [1.0, 2.0], 0.5),
-            axis("y", [2.0, 3.0], [8000.0], [4.0], 1.0),
+            axis("x", [1.0, 2.0, 1.5], [3000.0, 5000.0], [1.0, 2.0], 0.5, 0.3),
+            axis("y", [2.0, 3.0], [8000.0], [4.0], 1.0, 0.7),
         ),
         (Coupling(("x", "y"), -0.4),),
     )
@@ -115,7 +116,13 @@ def test_everything_at_once_within_its_standard_errors(rng):
     misses = []
     for _ in range(6):
         data = measure(truth, omega, 2e-3, rng, delays)
-        found = refine(disturbed(truth, rng), data, fit_delay=True, fit_friction=True)
+        found = refine(
+            disturbed(truth, rng),
+            data,
+            fit_delay=True,
+            fit_friction=True,
+            fit_load_friction=True,
+        )
         parameters = machine_parameters(truth, omega)
         values = parameter_values(truth, parameters, list(delays))
         true = dict(zip([p.name for p in parameters], values, strict=True))
