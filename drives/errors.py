@@ -98,8 +98,17 @@ class StoppedError(DrivesError):
 class SafetyStopError(StoppedError):
     """A limit was passed, or a drive failed, while the machine moved; all axes were stopped."""
 
-    def __init__(self, message: str, *, axis: str | None = None, cycle: int | None = None) -> None:
+    def __init__(
+        self,
+        message: str,
+        *,
+        axis: str | None = None,
+        cycle: int | None = None,
+        runaway: bool = False,
+    ) -> None:
         self.axis, self.cycle = axis, cycle
+        self.runaway = runaway
+        """The axis moves by itself: a quick stop may make it worse, its power is cut at once."""
         super().__init__(message)
 
 

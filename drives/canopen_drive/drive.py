@@ -21,6 +21,7 @@ from drives.cia402 import Mode, PowerState, emergency_text
 from drives.errors import (
     DriveFaultError,
     DrivesError,
+    LimitsError,
     NodeAbsentError,
     NothingMovedError,
     NotSupportedError,
@@ -80,6 +81,16 @@ class CanopenDrive:
             limits.torque,
             limits.following_error,
         )
+
+    @property
+    def position_unit(self) -> str:
+        """Unit of positions: rad or m."""
+        return "rad" if self._axis.kind == "rotary" else "m"
+
+    @property
+    def torque_unit(self) -> str:
+        """Unit of torques: N m or N."""
+        return "N m" if self._axis.kind == "rotary" else "N"
 
     @property
     def identity(self) -> DriveIdentity:
@@ -299,6 +310,34 @@ class CanopenDrive:
             raise NotSupportedError(f"{self.axis}: position has no scale: {error}.") from None
         self._scaling = AxisScaling(position, position, self._rated_torque / 1000)
         return self._scaling
+
+    def check_limits(self) -> None:
+        """Refuse limits that the drive's units can not express: they could not be watched.
+
+        Raises
+        ------
+        LimitsError
+            With the limit, and what the drive can express.
+        """
+        scale, limits = self.scaling, self.limits
+        low, high = limits.travel
+        most = 2**31 * scale.position
+        if not (-most <= low and high < most):
+            raise LimitsError(
+                f"{self.axis}: travel {low:g} to {high:g} {self.position_unit} is more than the "
+                f"drive's position can show, {-most:.4g} to {most:.4g} {self.position_unit}. Give the "
+                "axis' real travel in the machine profile."
+            )
+        for what, limit, unit, smallest in (
+            ("following error", limits.following_error, self.position_unit, scale.position),
+            ("torque", limits.torque, self.torque_unit, scale.torque),
+        ):
+            if limit < smallest:
+                raise LimitsError(
+                    f"{self.axis}: the {what} limit {limit:g} {unit} is less than the drive's "
+                    f"resolution of {smallest:.4g} {unit}, so it can not be watched. Correct it in "
+                    "the machine profile."
+                )
 
     def read_position(self) -> float:
         """Read the actual position 0x6064, rad or m."""

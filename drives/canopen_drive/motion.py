@@ -1,32 +1,22 @@
 """Enabled axes: targets out and positions in at every SYNC, limits watched in every cycle.
 
-One PDO each way and axis: controlword, target position, target torque; statusword, actual
-position, actual torque.  When a limit is passed or a drive fails, *all* axes get a quick stop in
-the next cycle and are disabled once they stand; a runaway is disabled at once.
+When a limit is passed or a drive fails, *all* axes get a quick stop in the next cycle and are
+disabled once they stand; the power of one that runs away is cut at once, because a quick stop by a
+loop of the wrong sign would only make it faster.
 """
 
-import signal
-import struct
-import threading
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
 
 import can
 import numpy as np
 
 from drives.api import Capture, FloatArray, Source, joined
+from drives.canopen_drive.channel import INPUT, NMT_OPERATIONAL, OUTPUT, Channel, channel_of
 from drives.canopen_drive.drive import CanopenDrive
+from drives.canopen_drive.interrupts import uninterrupted
 from drives.canopen_drive.line import Line
-from drives.canopen_drive.setup import DRIVE_HEARTBEAT, HOST_HEARTBEAT, HOST_NODE_ID
-from drives.cia402 import (
-    ENABLED_MASK,
-    ENABLED_VALUE,
-    STEP_TOWARDS_ENABLED,
-    Controlword,
-    PowerState,
-    emergency_text,
-)
+from drives.canopen_drive.setup import HOST_HEARTBEAT, HOST_NODE_ID
+from drives.cia402 import ENABLED_VALUE, STEP_TOWARDS_ENABLED, Controlword, PowerState
 from drives.errors import (
     BusError,
     DriveFaultError,
@@ -36,54 +26,18 @@ from drives.errors import (
     UserStopError,
 )
 
-OUTPUT = struct.Struct("<Hih")
-INPUT = struct.Struct("<Hih")
 INPUT_ROW = np.dtype([("statusword", "<u2"), ("position", "<i4"), ("torque", "<i2")])
 OUTPUT_ROW = np.dtype([("controlword", "<u2"), ("position", "<i4"), ("torque", "<i2")])
-NMT_OPERATIONAL = 5
 
 STATE_TIMEOUT = 3.0
 """Seconds a drive may take from one power state to the next (a brake may have to open)."""
 STOP_TIMEOUT = 5.0
 """Seconds after which axes that still move are disabled."""
-MISSING_ALLOWED = 1
-"""Cycles in a row in which a PDO may be missing."""
-HEARTBEATS_MISSED = 3.5
-"""Heartbeat times after which a silent drive counts as lost."""
+RUNAWAY_SHARE, RUNAWAY_GROWTH, RUNAWAY_CYCLES = 0.25, 1.25, 3
+"""An axis runs away that, for so many cycles of a quick stop, is faster than this share of its
+velocity limit and than it was at the start of the stop times the growth."""
 REPLY_SHARE = 0.9
 """Share of the cycle within which the drives' PDOs have to come."""
-
-
-@dataclass
-class _Channel:
-    """Run-time state of one axis."""
-
-    drive: CanopenDrive
-    free: bool
-    output: can.Message
-    low: int
-    high: int
-    step: int
-    """Largest change of position units from SYNC to SYNC."""
-    torque: int
-    window: int
-    """Following error window, position units."""
-    last: bytes = b""
-    statusword: int = 0
-    position: int = 0
-    previous: int = 0
-    """Position one sample before."""
-    allowed: int = 0
-    """Largest change of position units since then."""
-    missing: int = 0
-    heard: float = 0.0
-    emergencies: list[int] = field(default_factory=list)
-    nmt_state: int = NMT_OPERATIONAL
-    rebooted: bool = False
-
-    @property
-    def state(self) -> PowerState:
-        return PowerState.of(self.statusword)
 
 
 class CanopenMotion:
@@ -98,8 +52,9 @@ class CanopenMotion:
         stop_requested: Callable[[], bool],
     ) -> None:
         self._line, self._cycle_time, self._stop_requested = line, cycle_time, stop_requested
-        self._channels = [_channel(d, cycle_time, d.axis in free) for d in drives]
+        self._channels = [channel_of(d, cycle_time, d.axis in free) for d in drives]
         self._by_cob = {0x180 + c.drive.node_id: k for k, c in enumerate(self._channels)}
+        self._by_node = {c.drive.node_id: c for c in self._channels}
         self._sync = can.Message(arbitration_id=0x80, is_extended_id=False)
         self._heartbeat = can.Message(
             arbitration_id=0x700 + HOST_NODE_ID, data=bytes([NMT_OPERATIONAL]), is_extended_id=False
@@ -136,10 +91,14 @@ class CanopenMotion:
             while (block := source(previous)) is not None:
                 previous = self._follow(block, captures)
         except BaseException as error:
-            self.stop()
-            if isinstance(error, StoppedError):
-                error.capture = joined(captures) if captures else None
-            raise
+            self.stop(error)
+            stopped = _as_stopped(error)
+            if stopped is None:
+                raise
+            stopped.capture = joined(captures) if captures else None
+            if stopped is error:
+                raise
+            raise stopped from error
         return joined(captures)
 
     # --- enabling and disabling ----------------------------------------------------------------
@@ -151,6 +110,8 @@ class CanopenMotion:
         ------
         DriveFaultError
             If a drive does not reach ``operation enabled``.
+        SafetyStopError
+            If an axis leaves a limit as soon as it is enabled; all are disabled.
         """
         now = self._line.clock.now()
         self._start, self._count, self._next_heartbeat = now + self._cycle_time, 0, now
@@ -165,8 +126,9 @@ class CanopenMotion:
         slow = [c for c in self._channels if c.state is not PowerState.OPERATION_ENABLED]
         if slow:
             raise DriveFaultError(
-                f"{slow[0].drive.axis}: the drive stays in {slow[0].state.words} and can not be "
-                f"enabled; its last error is {slow[0].drive.last_error()}."
+                f"{slow[0].drive.axis}: the drive stays in {slow[0].state_words} and can not be "
+                f"enabled; its last error is {slow[0].drive.last_error()}. Check its enable input, "
+                "its supply and its brake."
             )
 
     def _await_inputs(self) -> None:
@@ -183,8 +145,9 @@ class CanopenMotion:
     def _towards_enabled(self) -> None:
         wanted = {}
         for k, channel in enumerate(self._channels):
-            if channel.state in STEP_TOWARDS_ENABLED:
-                wanted[k] = STEP_TOWARDS_ENABLED[channel.state]
+            step = STEP_TOWARDS_ENABLED.get(channel.state) if channel.state else None
+            if step is not None:
+                wanted[k] = step
         for _ in range(round(STATE_TIMEOUT / self._cycle_time)):
             words = [
                 self._word(c, wanted[k][0] if k in wanted else Controlword.ENABLE_OPERATION)
@@ -193,64 +156,87 @@ class CanopenMotion:
             self._cycle(words)
             self._check_user()
             for channel in self._channels:
-                if channel.emergencies or channel.state in (
-                    PowerState.FAULT,
-                    PowerState.FAULT_REACTION_ACTIVE,
-                ):
-                    raise DriveFaultError(self._trouble(channel))
+                self._check_enabling(channel)
             if all(self._channels[k].state is after for k, (_, after) in wanted.items()):
                 return
+
+    def _check_enabling(self, channel: Channel) -> None:
+        if channel.emergencies or channel.state in (
+            None,
+            PowerState.FAULT,
+            PowerState.FAULT_REACTION_ACTIVE,
+        ):
+            raise DriveFaultError(channel.trouble())
+        if channel.state is PowerState.OPERATION_ENABLED:
+            if channel.hold is None:
+                channel.hold = channel.position
+            if not channel.is_fine(channel.hold, self._line.clock.now()):
+                raise SafetyStopError(
+                    channel.violation(channel.hold, self._cycle_time),
+                    axis=channel.drive.axis,
+                    cycle=self._count - 1,
+                    runaway=True,
+                )
 
     def end(self) -> None:
         """Disable every axis and stop listening; the normal end, with all axes at rest."""
         try:
             if not self._stopped:
-                with _uninterrupted():
-                    self._disable(Controlword.SHUTDOWN)
+                with uninterrupted():
+                    self._stopped = True
+                    self._or_last_resort(lambda: self._disable(Controlword.SHUTDOWN))
         finally:
             for channel in self._channels:
                 node_id = channel.drive.node_id
                 self._line.unsubscribe(0x80 + node_id, self._on_emergency)
                 self._line.unsubscribe(0x700 + node_id, self._on_heartbeat)
 
-    def stop(self) -> None:
-        """Quick stop all axes at once, then disable them; never raises for what a drive does."""
+    def stop(self, cause: BaseException | None = None) -> None:
+        """Quick stop all axes at once, then disable them; never raises for what a drive does.
+
+        The axis that a ``SafetyStopError`` calls a runaway is not ramped down: its power is cut.
+        """
         if self._stopped:
             return
-        self._stopped = True
-        with _uninterrupted():
-            try:
-                self._quick_stop()
-                self._disable(Controlword.DISABLE_VOLTAGE)
-            except (DrivesError, can.CanError, OSError):
-                self._last_resort()
+        with uninterrupted():
+            self._stopped = True
+            runaway = cause.axis if isinstance(cause, SafetyStopError) and cause.runaway else None
+            self._or_last_resort(lambda: self._quick_stop(runaway))
 
-    def _quick_stop(self) -> None:
+    def _or_last_resort(self, action: Callable[[], None]) -> None:
+        try:
+            action()
+        except Exception:  # whatever it was, the axes must not stay enabled
+            self._last_resort()
+
+    def _quick_stop(self, runaway: str | None) -> None:
         """Command a quick stop until every axis stands or is off; cut the power of a runaway."""
-        words = [Controlword.QUICK_STOP] * len(self._channels)
-        speeds = [abs(c.position - c.previous) for c in self._channels]
-        before = [c.position for c in self._channels]
-        limit = [max(2 * s, 4 * c.step) for s, c in zip(speeds, self._channels, strict=True)]
+        channels = self._channels
+        words = [
+            Controlword.DISABLE_VOLTAGE if c.drive.axis == runaway else Controlword.QUICK_STOP
+            for c in channels
+        ]
+        fast = [
+            max(RUNAWAY_GROWTH * abs(c.position - c.previous), RUNAWAY_SHARE * c.step)
+            for c in channels
+        ]
+        too_fast = [0] * len(channels)
+        before = [c.position for c in channels]
         still = 0
         for _ in range(round(STOP_TIMEOUT / self._cycle_time)):
-            self._cycle([self._word(c, w) for c, w in zip(self._channels, words, strict=True)])
+            self._cycle([self._word(c, w) for c, w in zip(channels, words, strict=True)])
             moving = False
-            for k, c in enumerate(self._channels):
+            for k, c in enumerate(channels):
                 moved = abs(c.position - before[k])
                 before[k] = c.position
-                if moved > limit[k]:
+                too_fast[k] = too_fast[k] + 1 if moved > fast[k] else 0
+                if too_fast[k] >= RUNAWAY_CYCLES:
                     words[k] = Controlword.DISABLE_VOLTAGE
-                powered = c.statusword & 0x6F in (
-                    ENABLED_VALUE,
-                    PowerState.QUICK_STOP_ACTIVE.value[1],
-                )
-                if powered and c.missing == 0 and moved > max(2, c.step // 100):
-                    moving = True
-                if powered and c.statusword & 0x6F == ENABLED_VALUE and c.missing == 0:
-                    moving = True
+                moving = moving or _still_moves(c, moved)
             still = 0 if moving else still + 1
             if still >= 3:
-                return
+                break
+        self._disable(Controlword.DISABLE_VOLTAGE)
 
     def _disable(self, first: Controlword) -> None:
         for word in dict.fromkeys((first, Controlword.DISABLE_VOLTAGE)):
@@ -279,23 +265,8 @@ class CanopenMotion:
 
     def _follow(self, targets: FloatArray, captures: list[Capture]) -> Capture:
         """Send a block of targets; what came back joins ``captures`` whatever happens."""
-        n = targets.shape[0]
-        if targets.shape != (n, len(self._channels)) or not np.all(np.isfinite(targets)):
-            raise ValueError(
-                f"targets must be finite, of shape (n, {len(self._channels)}), got {targets.shape}"
-            )
-        first = self._count
-        frames: list[bytes] = []
-        units = np.empty((n, len(self._channels)), dtype=np.int32)
-        for k, channel in enumerate(self._channels):
-            rows = np.zeros(n, dtype=OUTPUT_ROW)
-            rows["controlword"] = Controlword.ENABLE_OPERATION
-            if channel.free:
-                units[:, k] = channel.position
-            else:
-                units[:, k] = np.rint(targets[:, k] / channel.drive.scaling.position)
-            rows["position"] = units[:, k]
-            frames.append(rows.tobytes())
+        units, frames = self._outputs(targets)
+        first, n = self._count, targets.shape[0]
         received = [bytearray() for _ in self._channels]
         missing: list[int] = []
         try:
@@ -310,6 +281,41 @@ class CanopenMotion:
         finally:
             captures.append(self._capture(first, targets, received, missing))
         return captures[-1]
+
+    def _outputs(
+        self, targets: FloatArray
+    ) -> tuple[np.ndarray[tuple[int, int], np.dtype[np.int32]], list[bytes]]:
+        """Return targets in position units, shape (n, M), and each axis' PDOs, 8 bytes a row."""
+        n, m = targets.shape[0], len(self._channels)
+        if targets.shape != (n, m) or not np.all(np.isfinite(targets)):
+            raise ValueError(f"targets must be finite, of shape (n, {m}), got {targets.shape}")
+        units = np.empty((n, m), dtype=np.int32)
+        frames: list[bytes] = []
+        for k, channel in enumerate(self._channels):
+            rows = np.zeros(n, dtype=OUTPUT_ROW)
+            rows["controlword"] = Controlword.ENABLE_OPERATION
+            if channel.free:
+                units[:, k] = channel.position
+            else:
+                wanted = np.rint(targets[:, k] / channel.drive.scaling.position)
+                self._check_inside(channel, wanted)
+                units[:, k] = wanted
+            rows["position"] = units[:, k]
+            frames.append(rows.tobytes())
+        return units, frames
+
+    def _check_inside(self, channel: Channel, wanted: FloatArray) -> None:
+        outside = wanted[(wanted < channel.low) | (wanted > channel.high)]
+        if outside.size:
+            drive = channel.drive
+            raise SafetyStopError(
+                f"{drive.axis}: a target of {outside[0] * drive.scaling.position:.4g} "
+                f"{drive.position_unit} is outside the travel {drive.limits.travel[0]:g} to "
+                f"{drive.limits.travel[1]:g} {drive.position_unit}; it was not sent, and all axes "
+                "were stopped.",
+                axis=drive.axis,
+                cycle=self._count,
+            )
 
     def _capture(
         self, first: int, targets: FloatArray, received: list[bytearray], missing: list[int]
@@ -344,53 +350,57 @@ class CanopenMotion:
             self.late_cycles += 1
             self._start += late
             moment += late
+        self._take_late_frames()
         line.send(self._sync)
         self._count += 1
         return self._collect(moment + REPLY_SHARE * self._cycle_time)
 
+    def _take_late_frames(self) -> None:
+        """Hand on what came since the last cycle; a PDO that is late for its SYNC is dropped."""
+        while (message := self._receive(0.0)) is not None:
+            if message.arbitration_id not in self._by_cob:
+                self._hand_on(message)
+
     def _collect(self, deadline: float) -> bool:
-        line, by_cob, channels = self._line, self._by_cob, self._channels
-        bus, clock = line.can_bus, line.clock
+        by_cob, channels, clock = self._by_cob, self._channels, self._line.clock
         awaited = set(by_cob.values())
         while awaited:
-            try:
-                message = bus.recv(max(0.0, deadline - clock.now()))
-            except (can.CanError, OSError) as error:
-                raise BusError(f"the bus does not deliver frames any more: {error}") from error
+            message = self._receive(max(0.0, deadline - clock.now()))
             if message is None:
                 break
             k = by_cob.get(message.arbitration_id)
             if k is None or len(message.data) != INPUT.size:
-                if not (message.is_error_frame or message.is_remote_frame):
-                    line.notify(message.arbitration_id, message.data, message.timestamp)
+                self._hand_on(message)
                 continue
-            channel = channels[k]
-            first = not channel.last
-            channel.previous = channel.position
-            channel.last = bytes(message.data)
-            channel.statusword, channel.position, _ = INPUT.unpack(channel.last)
-            if first:
-                channel.previous = channel.position
-            channel.allowed = channel.step * (1 + channel.missing)
-            channel.missing = 0
+            channels[k].take(bytes(message.data))
             awaited.discard(k)
         for k in awaited:
             channels[k].missing += 1
         return not awaited
 
-    def _word(self, channel: _Channel, word: Controlword) -> bytes:
-        return OUTPUT.pack(word, channel.position, 0)
+    def _receive(self, timeout: float) -> can.Message | None:
+        try:
+            return self._line.can_bus.recv(timeout)
+        except (can.CanError, OSError) as error:
+            raise BusError(f"the bus does not deliver frames any more: {error}") from error
+
+    def _hand_on(self, message: can.Message) -> None:
+        if not (message.is_error_frame or message.is_remote_frame):
+            self._line.notify(message.arbitration_id, message.data, message.timestamp)
+
+    def _word(self, channel: Channel, word: Controlword) -> bytes:
+        position = channel.position if channel.hold is None else channel.hold
+        return OUTPUT.pack(word, position, 0)
 
     # --- watching ------------------------------------------------------------------------------
 
     def _on_emergency(self, can_id: int, data: bytearray, _timestamp: float) -> None:
-        channel = next(c for c in self._channels if 0x80 + c.drive.node_id == can_id)
         code = int.from_bytes(data[0:2], "little")
         if code >> 8:  # 0x00xx: error reset
-            channel.emergencies.append(code)
+            self._by_node[can_id - 0x80].emergencies.append(code)
 
     def _on_heartbeat(self, can_id: int, data: bytearray, _timestamp: float) -> None:
-        channel = next(c for c in self._channels if 0x700 + c.drive.node_id == can_id)
+        channel = self._by_node[can_id - 0x700]
         channel.heard = self._line.clock.now()
         channel.nmt_state = data[0] & 0x7F if data else 0
         if channel.nmt_state == 0:
@@ -398,116 +408,41 @@ class CanopenMotion:
 
     def _check_user(self) -> None:
         if self._stop_requested():
-            raise UserStopError("stopped by the user")
+            raise UserStopError(
+                "stopped by the user: all axes were stopped and disabled. What was recorded until "
+                "then is kept."
+            )
 
     def _check(self, targets: np.ndarray[tuple[int], np.dtype[np.int32]]) -> None:
         """Raise SafetyStopError for the first thing that is not as it has to be."""
         self._check_user()
         now = self._line.clock.now()
         for channel, target in zip(self._channels, targets.tolist(), strict=True):
-            statusword, position, torque = INPUT.unpack(channel.last)
-            if (
-                statusword & ENABLED_MASK == ENABLED_VALUE
-                and channel.low <= position <= channel.high
-                and -channel.torque <= torque <= channel.torque
-                and -channel.allowed <= position - channel.previous <= channel.allowed
-                and (channel.free or -channel.window <= target - position <= channel.window)
-                and not channel.emergencies
-                and channel.missing <= MISSING_ALLOWED
-                and channel.nmt_state == NMT_OPERATIONAL
-                and not channel.rebooted
-                and now - channel.heard <= HEARTBEATS_MISSED * DRIVE_HEARTBEAT
-            ):
-                continue
-            message = self._violation(channel, target)
-            raise SafetyStopError(message, axis=channel.drive.axis, cycle=self._count - 1)
+            if not channel.is_fine(target, now):
+                raise SafetyStopError(
+                    channel.violation(target, self._cycle_time),
+                    axis=channel.drive.axis,
+                    cycle=self._count - 1,
+                )
 
-    def _violation(self, channel: _Channel, target: int) -> str:
-        drive, scale = channel.drive, channel.drive.scaling
-        limits = drive.limits
-        unit = "rad" if drive.axis_profile.kind == "rotary" else "m"
-        torque_unit = "N m" if unit == "rad" else "N"
-        statusword, position, torque = INPUT.unpack(channel.last)
-        if channel.missing > MISSING_ALLOWED:
-            return (
-                f"{drive.axis}: node {drive.node_id} sent no PDO for {channel.missing} cycles; all "
-                "axes were stopped. Check its supply and its cable."
-            )
-        if channel.rebooted or channel.nmt_state != NMT_OPERATIONAL:
-            return (
-                f"{drive.axis}: node {drive.node_id} left NMT operational"
-                f"{' (it rebooted)' if channel.rebooted else ''}; all axes were stopped."
-            )
-        if channel.emergencies or statusword & ENABLED_MASK != ENABLED_VALUE:
-            return self._trouble(channel)
-        if not channel.low <= position <= channel.high:
-            return (
-                f"{drive.axis}: position {position * scale.position:.4g} {unit} is outside the "
-                f"travel {limits.travel[0]:g} to {limits.travel[1]:g} {unit}; all axes were stopped."
-            )
-        if abs(torque) > channel.torque:
-            return (
-                f"{drive.axis}: torque {torque * scale.torque:.4g} {torque_unit} is above the limit "
-                f"{limits.torque:g} {torque_unit}; all axes were stopped."
-            )
-        if not channel.free and abs(target - position) > channel.window:
-            error = (target - position) * scale.position
-            return (
-                f"{drive.axis}: following error {error:.4g} {unit} is above the limit "
-                f"{limits.following_error:g} {unit}; all axes were stopped. Does the axis move the "
-                "wrong way, or is it blocked?"
-            )
-        if abs(position - channel.previous) > channel.allowed:
-            cycles = channel.allowed // channel.step
-            speed = (position - channel.previous) * scale.position / (self._cycle_time * cycles)
-            return (
-                f"{drive.axis}: velocity {speed:.4g} {unit}/s is above the limit "
-                f"{limits.velocity:g} {unit}/s; all axes were stopped. Does the axis move the wrong "
-                "way?"
-            )
-        return (
-            f"{drive.axis}: node {drive.node_id} sent no heartbeat for "
-            f"{HEARTBEATS_MISSED * DRIVE_HEARTBEAT:.2g} s; all axes were stopped."
+
+def _still_moves(channel: Channel, moved: int) -> bool:
+    """Whether a quick stop of this axis is still at work; one that is off or mute is done."""
+    state = channel.statusword & 0x6F
+    if channel.missing or state not in (ENABLED_VALUE, PowerState.QUICK_STOP_ACTIVE.value[1]):
+        return False
+    return state == ENABLED_VALUE or moved > max(2, channel.step // 100)
+
+
+def _as_stopped(error: BaseException) -> StoppedError | None:
+    """Return the error that says the machine was stopped, for causes that stop it; else None."""
+    if isinstance(error, StoppedError):
+        return error
+    if isinstance(error, KeyboardInterrupt):
+        return UserStopError("stopped by the user: all axes were stopped and disabled.")
+    if isinstance(error, DrivesError):
+        return SafetyStopError(
+            f"{error} The axes were told to stop; a drive that did not hear it stops by itself when "
+            "it misses the host's heartbeat. See that the machine stands before you go near it."
         )
-
-    @staticmethod
-    def _trouble(channel: _Channel) -> str:
-        axis, node_id = channel.drive.axis, channel.drive.node_id
-        if channel.emergencies:
-            said = ", ".join(emergency_text(code) for code in channel.emergencies[:3])
-            return f"{axis}: node {node_id} reports emergency {said}; all axes were stopped."
-        try:
-            state = channel.state.words
-        except ValueError:
-            state = "no CiA 402 state"
-        return (
-            f"{axis}: the drive left operation enabled: statusword 0x{channel.statusword:04X} "
-            f"({state}); all axes were stopped."
-        )
-
-
-def _channel(drive: CanopenDrive, cycle_time: float, free: bool) -> _Channel:
-    scale, limits = drive.scaling, drive.limits
-    return _Channel(
-        drive,
-        free,
-        can.Message(arbitration_id=0x200 + drive.node_id, data=bytes(8), is_extended_id=False),
-        low=scale.position_units(limits.travel[0]),
-        high=scale.position_units(limits.travel[1]),
-        step=max(2, int(limits.velocity * cycle_time / scale.velocity) + 1),
-        torque=scale.torque_units(limits.torque),
-        window=scale.position_units(limits.following_error),
-    )
-
-
-@contextmanager
-def _uninterrupted() -> Iterator[None]:
-    """Let nothing from the keyboard cut a stop short."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
+    return None

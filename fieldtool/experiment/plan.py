@@ -137,7 +137,7 @@ def transition(tone: Tone | None, before: Tone | None) -> FloatArray:
     """Return the way from one tone (None: from rest) to the next (None: to rest), shape (n,).
 
     It starts where a block of the tone before ends, and ends where a block of the next one begins:
-    at phase zero.
+    at phase zero, and with the velocity of that block.
 
     Raises
     ------
@@ -154,7 +154,9 @@ def transition(tone: Tone | None, before: Tone | None) -> FloatArray:
     frequency = a.frequency + (b.frequency - a.frequency) * blend
     turns = np.concatenate([[0.0], np.cumsum(frequency) * known.cycle_time])
     whole = max(1, round(turns[-1]))
-    phase = 2 * np.pi * turns[:-1] * whole / turns[-1]
+    phase = (
+        2 * np.pi * (turns[:-1] + (whole - turns[-1]) * blend)
+    )  # whole turns, no kink at the ends
     low = before.amplitude if before else 0.0
     high = tone.amplitude if tone else 0.0
     displacement: FloatArray = (low + (high - low) * blend) * np.sin(phase)

@@ -6,30 +6,26 @@ response, the share that makes the misfit what it should be, so that neither the
 the weak ones decide alone, and the standard errors are honest.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import eig, eigh
 
 from fieldtool.errors import NotEnoughDataError
 from fieldtool.frf.matrix import column_responses
 from fieldtool.frf.multisine import analyse_multisine
 from fieldtool.frf.response import FrequencyResponse
+from fieldtool.identify.features import ChainFeatures, chain_features
 from fieldtool.identify.modal_chain import reduce_modes
 from fieldtool.identify.modes import fit_modes
-from fieldtool.identify.parameters import machine_parameters, parameter_values, with_values
 from fieldtool.identify.refine import RefinedModel, refine
 from fieldtool.identify.response_data import ResponseMatrix
-from fieldtool.records.model import Estimate, FloatArray, MachineModel
+from fieldtool.records.model import Estimate, MachineModel
 from fieldtool.records.recording import Recording
 
 START_SHARE = 0.05
 """Of the response: model error reckoned with while start values are sought."""
 SHARES = (0.0, 0.003, 0.01, 0.02, 0.03, 0.05, 0.1)
 """Of the response: model errors to try, the smallest that explains the misfit is taken."""
-STEP = 1e-5
-"""Relative step of the features' derivatives."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,14 +35,7 @@ class ChainResult:
     model: MachineModel
     delay: Estimate
     """From torque to position, s."""
-    resonances: tuple[Estimate, ...]
-    """Hz, undamped, rising."""
-    antiresonances: tuple[Estimate, ...]
-    """Hz, undamped, rising."""
-    damping_ratios: tuple[Estimate, ...]
-    """Of the resonances."""
-    inertia_ratio: Estimate
-    """Last mass over first mass."""
+    features: ChainFeatures
     model_error: float
     """Share of the response that the model can not explain."""
     response: FrequencyResponse
@@ -55,11 +44,12 @@ class ChainResult:
     @property
     def sentences(self) -> tuple[str, ...]:
         """The features, one sentence each, with standard errors."""
-        lines = [f"inertia ratio load / motor {_shown(self.inertia_ratio)}"]
+        features = self.features
+        lines = [f"inertia ratio load / motor {_shown(features.inertia_ratio)}"]
         for name, values, unit in (
-            ("antiresonance", self.antiresonances, " Hz"),
-            ("resonance", self.resonances, " Hz"),
-            ("damping ratio of the resonance", self.damping_ratios, ""),
+            ("antiresonance", features.antiresonances, " Hz"),
+            ("resonance", features.resonances, " Hz"),
+            ("damping ratio of the resonance", features.damping_ratios, ""),
         ):
             lines += [f"{name} {_shown(value)}{unit}" for value in values]
         delay = Estimate(1e3 * self.delay.value, 1e3 * self.delay.std)
@@ -99,14 +89,10 @@ def identify_chain(recording: Recording, masses: int) -> ChainResult:
             f"{100 * share:.2g} % of the response is not explained by masses, springs, dampers, delay "
             "and viscous friction; noise is far below that."
         )
-    features = _Features(fitted)
     return ChainResult(
         model=fitted.model,
         delay=fitted.delays[0],
-        resonances=features.estimates(_resonances),
-        antiresonances=features.estimates(_antiresonances),
-        damping_ratios=features.estimates(_damping_ratios),
-        inertia_ratio=features.estimates(_inertia_ratio)[0],
+        features=chain_features(fitted),
         model_error=share,
         response=response,
         notes=tuple(notes),
@@ -144,63 +130,6 @@ def _fitted(response: FrequencyResponse, start: MachineModel) -> tuple[float, Re
     return best
 
 
-class _Features:
-    """Values that follow from the fitted parameters, with errors by linear propagation."""
-
-    def __init__(self, fitted: RefinedModel) -> None:
-        self._fitted = fitted
-
-    def estimates(self, feature: Callable[[MachineModel], FloatArray]) -> tuple[Estimate, ...]:
-        fitted = self._fitted
-        values = feature(fitted.model)
-        jacobian = np.zeros((values.size, fitted.values.size))
-        for k, value in enumerate(fitted.values):
-            step = STEP * max(abs(value), 1e-12)
-            above = feature(_moved(fitted, k, step))
-            jacobian[:, k] = (above - values) / step
-        covariance = jacobian @ fitted.covariance @ jacobian.T
-        errors = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-        return tuple(Estimate(float(v), float(e)) for v, e in zip(values, errors, strict=True))
-
-
-def _moved(fitted: RefinedModel, k: int, step: float) -> MachineModel:
-    """Return the fitted machine with one fitted parameter changed."""
-    listed = machine_parameters(fitted.model, np.ones(1))
-    values = parameter_values(fitted.model, listed, [d.value for d in fitted.delays])
-    place = next(i for i, p in enumerate(listed) if p.name == fitted.names[k])
-    values[place] += step
-    return with_values(fitted.model, listed, values)[0]
-
-
 def _shown(value: Estimate) -> str:
     digits = max(0, 1 - int(np.floor(np.log10(value.std)))) if value.std > 0 else 4
     return f"{value.value:.{digits}f} ± {value.std:.{digits}f}"
-
-
-def _resonances(model: MachineModel) -> FloatArray:
-    values = eigh(model.stiffness_matrix, model.mass_matrix, eigvals_only=True)
-    result: FloatArray = np.sqrt(np.abs(values[1:])) / (2 * np.pi)
-    return result
-
-
-def _antiresonances(model: MachineModel) -> FloatArray:
-    values = eigh(model.stiffness_matrix[1:, 1:], model.mass_matrix[1:, 1:], eigvals_only=True)
-    result: FloatArray = np.sqrt(values) / (2 * np.pi)
-    return result
-
-
-def _damping_ratios(model: MachineModel) -> FloatArray:
-    mass, n = model.mass_matrix, model.mass_matrix.shape[0]
-    zero, one = np.zeros((n, n)), np.eye(n)
-    a = np.block([[zero, one], [-model.stiffness_matrix, -model.damping_matrix]])
-    b = np.block([[one, zero], [zero, mass]])
-    poles = eig(a, b, right=False)
-    upper = poles[poles.imag > 1e-6 * np.abs(poles).max()]
-    upper = upper[np.argsort(np.abs(upper))]
-    result: FloatArray = -upper.real / np.abs(upper)
-    return result
-
-
-def _inertia_ratio(model: MachineModel) -> FloatArray:
-    masses = model.axes[0].masses
-    return np.array([masses[-1].value / masses[0].value])

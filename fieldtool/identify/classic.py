@@ -14,7 +14,7 @@ reduction, and moves masses, springs and couplings too, because each of them the
 measured points and not on single ones.  Both results have to agree.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from math import hypot
@@ -219,8 +219,11 @@ def _refined(
     """Fit everything to all points, starting from the order reduction; keep that if they disagree."""
     try:
         fitted = refine(reduced, data, fit_friction=modal.parts.friction)
-        if modal.parts.friction and not _friction_seen(fitted.model):
-            fitted = refine(without_friction(fitted.model), data)
+        unseen = _without_friction_seen(fitted.model) if modal.parts.friction else ()
+        if unseen:
+            fixed = [f"{name}.viscous_friction" for name in unseen]
+            start = without_friction(fitted.model, unseen)
+            fitted = refine(start, data, fixed=fixed, fit_friction=True)
     except IdentificationError as error:
         return reduced, (f"The refinement failed, so dampers are not known: {error}",)
     notes = [unknown.reason for unknown in fitted.unknown]
@@ -234,15 +237,23 @@ def _refined(
     return fitted.model, notes
 
 
-def _friction_seen(model: MachineModel) -> bool:
-    return any(
-        axis.viscous_friction.value > SIGNIFICANT * axis.viscous_friction.std for axis in model.axes
+def _without_friction_seen(model: MachineModel) -> tuple[str, ...]:
+    """Return the axes whose friction at the motor can not be told from none."""
+    return tuple(
+        axis.name
+        for axis in model.axes
+        if axis.viscous_friction.value <= SIGNIFICANT * axis.viscous_friction.std
     )
 
 
-def without_friction(model: MachineModel) -> MachineModel:
-    """Return the model with no friction at its motors."""
-    axes = tuple(replace(axis, viscous_friction=Estimate(0.0)) for axis in model.axes)
+def without_friction(model: MachineModel, names: Collection[str] | None = None) -> MachineModel:
+    """Return the model with no friction at the motors of these axes (None: of all)."""
+    axes = tuple(
+        replace(axis, viscous_friction=Estimate(0.0))
+        if names is None or axis.name in names
+        else axis
+        for axis in model.axes
+    )
     return replace(model, axes=axes)
 
 

@@ -91,7 +91,7 @@ def identify_recording(
             _with_delay(chain),
             "multisine, maximum likelihood fit of masses, springs, dampers, delay and friction",
             {chain.response.condition: chain.response},
-            np.array([ratio.value for ratio in chain.damping_ratios]),
+            np.array([ratio.value for ratio in chain.features.damping_ratios]),
             chain.notes,
             units,
             chain,

@@ -11,7 +11,7 @@ N m s/rad on rotary ones.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from math import nan
+from math import isfinite, nan
 from typing import Any, Literal
 
 import numpy as np
@@ -177,15 +177,27 @@ class MachineModel:
         Raises
         ------
         ValueError
-            If a key is missing or unknown, or a value is no number.
+            If a key is missing or unknown, a value is no finite number, or friction is on no axis.
         """
+        try:
+            return cls._from_dict(data)
+        except KeyError as error:
+            raise ValueError(f"{error} is missing") from None
+
+    @classmethod
+    def _from_dict(cls, data: Mapping[str, Any]) -> "MachineModel":
         _only_keys(data, {"format", "axes", "couplings", "effects"}, "model")
         if data.get("format") != FORMAT:
             raise ValueError(f"format must be {FORMAT}, got {data.get('format')!r}")
+        names = [str(axis["name"]) for axis in data["axes"]]
         friction: dict[str, Mapping[str, Any]] = {}
         effects: list[Mapping[str, Any]] = []
         for effect in data.get("effects") or ():
             if effect.get("effect") == "viscous_friction":
+                if effect["axis"] not in names:
+                    raise ValueError(
+                        f"viscous friction is on axis {effect['axis']!r}, the axes are {names}"
+                    )
                 friction[effect["axis"]] = effect["parameters"]
             else:
                 effects.append(effect)
@@ -243,7 +255,10 @@ def _estimate(data: Any) -> Estimate:
 def _number(data: Any) -> float:
     if isinstance(data, bool) or not isinstance(data, int | float):
         raise ValueError(f"expected a number, got {data!r}")  # noqa: TRY004
-    return float(data)
+    value = float(data)
+    if not isfinite(value):
+        raise ValueError(f"expected a finite number, got {data!r}")
+    return value
 
 
 def _only_keys(data: Mapping[str, Any], known: set[str], what: str) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fieldtool.errors import NotEnoughDataError
-from fieldtool.identify.features import drive_point_features
+from fieldtool.identify.features import chain_features
 from fieldtool.identify.parameters import machine_parameters, parameter_values, with_values
 from fieldtool.identify.refine import machine_response, refine, response_derivatives
 from fieldtool.identify.response_data import ResponseMatrix
@@ -140,18 +140,17 @@ def test_two_masses_with_unknown_torque_constant(rng):
     for scale in (1.0, 17.0):
         data = measure(bench(scale), omega, 0.01, rng, np.array([1e-3]))
         found = refine(disturbed(bench(scale), rng, 0.3), data, fit_delay=True, fit_friction=True)
-        features = drive_point_features(found)
+        features = chain_features(found)
         for estimate, true in (
-            (features.antiresonance, np.sqrt(25000.0) / (2 * np.pi)),
-            (features.resonance, np.sqrt(50000.0) / (2 * np.pi)),
+            (features.antiresonances[0], np.sqrt(25000.0) / (2 * np.pi)),
+            (features.resonances[0], np.sqrt(50000.0) / (2 * np.pi)),
             (features.inertia_ratio, 1.0),
-            (features.antiresonance_damping, 0.02 / (2 * np.sqrt(10.0))),
         ):
             assert abs(estimate.value - true) < 5 * estimate.std
             assert 0 < estimate.std < 0.03 * true
         poles = np.roots(_determinant(bench(1.0).axes[0]))
         slow = poles[poles.imag > 1.0][0]
-        ratio = features.resonance_damping
+        ratio = features.damping_ratios[0]
         assert abs(ratio.value + slow.real / abs(slow)) < 5 * ratio.std
         assert found.delays[0].value == pytest.approx(1e-3, abs=1e-4)
 
@@ -213,12 +212,8 @@ def test_wrong_names_and_too_little_data_are_refused(rng):
         refine(truth, few)
 
 
-def test_features_need_two_masses_that_stand_alone(rng):
+def test_features_are_those_of_one_axis(rng):
     data = measure(two_axes(), np.geomspace(8.0, 250.0, 60), 1e-3, rng)
     found = refine(two_axes(), data)
-    with pytest.raises(ValueError, match="name one of the axes x, y"):
-        drive_point_features(found)
-    with pytest.raises(ValueError, match="axis x has 3 masses"):
-        drive_point_features(found, "x")
-    with pytest.raises(ValueError, match="axis y is coupled"):
-        drive_point_features(found, "y")
+    with pytest.raises(ValueError, match="the model has x, y"):
+        chain_features(found)

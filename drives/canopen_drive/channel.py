@@ -1,0 +1,176 @@
+"""One axis in motion as the host sees it: what it sent last, what it may do, and what is wrong.
+
+One PDO each way and axis: controlword, target position, target torque; statusword, actual
+position, actual torque.
+"""
+
+import struct
+from dataclasses import dataclass, field
+from math import floor
+
+import can
+
+from drives.canopen_drive.drive import CanopenDrive
+from drives.canopen_drive.setup import DRIVE_HEARTBEAT
+from drives.cia402 import ENABLED_MASK, ENABLED_VALUE, PowerState, emergency_text
+
+OUTPUT = struct.Struct("<Hih")
+INPUT = struct.Struct("<Hih")
+NMT_OPERATIONAL = 5
+
+MISSING_ALLOWED = 1
+"""Cycles in a row in which a PDO may be missing."""
+HEARTBEATS_MISSED = 3.5
+"""Heartbeat times after which a silent drive counts as lost."""
+_MOST_UNITS = 2**33
+"""More position units than any change or error of a 32-bit position can have."""
+
+
+@dataclass
+class Channel:
+    """Run-time state of one axis."""
+
+    drive: CanopenDrive
+    free: bool
+    output: can.Message
+    low: int
+    high: int
+    step: int
+    """Largest change of position units from SYNC to SYNC."""
+    torque: int
+    window: int
+    """Following error window, position units."""
+    last: bytes = b""
+    statusword: int = 0
+    position: int = 0
+    previous: int = 0
+    """Position one sample before."""
+    allowed: int = 0
+    """Largest change of position units since then."""
+    missing: int = 0
+    heard: float = 0.0
+    emergencies: list[int] = field(default_factory=list)
+    nmt_state: int = NMT_OPERATIONAL
+    rebooted: bool = False
+    hold: int | None = None
+    """Where it was first seen enabled, position units: its target until others are streamed."""
+
+    @property
+    def state(self) -> PowerState | None:
+        """Power state that the drive shows; None where the statusword shows none."""
+        try:
+            return PowerState.of(self.statusword)
+        except ValueError:
+            return None
+
+    @property
+    def state_words(self) -> str:
+        """The power state in words."""
+        return self.state.words if self.state else f"no CiA 402 state (0x{self.statusword:04X})"
+
+    def take(self, data: bytes) -> None:
+        """Take the drive's PDO of this SYNC."""
+        self.previous = self.position
+        first = not self.last
+        self.last = data
+        self.statusword, self.position, _ = INPUT.unpack(data)
+        if first:
+            self.previous = self.position
+        self.allowed = self.step * (1 + self.missing)
+        self.missing = 0
+
+    def is_fine(self, target: int, now: float) -> bool:
+        """Whether the drive is enabled, heard, and inside all limits; target in position units."""
+        statusword, position, torque = INPUT.unpack(self.last)
+        return (
+            statusword & ENABLED_MASK == ENABLED_VALUE
+            and self.low <= position <= self.high
+            and -self.torque <= torque <= self.torque
+            and -self.allowed <= position - self.previous <= self.allowed
+            and (self.free or -self.window <= target - position <= self.window)
+            and not self.emergencies
+            and self.missing <= MISSING_ALLOWED
+            and self.nmt_state == NMT_OPERATIONAL
+            and not self.rebooted
+            and now - self.heard <= HEARTBEATS_MISSED * DRIVE_HEARTBEAT
+        )
+
+    def violation(self, target: int, cycle_time: float) -> str:
+        """Return what is not fine, in a sentence."""
+        drive, scale, limits = self.drive, self.drive.scaling, self.drive.limits
+        unit, torque_unit = drive.position_unit, drive.torque_unit
+        statusword, position, torque = INPUT.unpack(self.last)
+        if self.missing > MISSING_ALLOWED:
+            return (
+                f"{drive.axis}: node {drive.node_id} sent no PDO for {self.missing} cycles; all "
+                "axes were stopped. Check its supply and its cable."
+            )
+        if self.rebooted or self.nmt_state != NMT_OPERATIONAL:
+            return (
+                f"{drive.axis}: node {drive.node_id} left NMT operational"
+                f"{' (it rebooted)' if self.rebooted else ''}; all axes were stopped. Check its "
+                "supply, and whether another master is on the bus."
+            )
+        if self.emergencies or statusword & ENABLED_MASK != ENABLED_VALUE:
+            return self.trouble()
+        if not self.low <= position <= self.high:
+            return (
+                f"{drive.axis}: position {position * scale.position:.4g} {unit} is outside the "
+                f"travel {limits.travel[0]:g} to {limits.travel[1]:g} {unit}; all axes were stopped. "
+                "Move it back inside before the next start."
+            )
+        if abs(torque) > self.torque:
+            return (
+                f"{drive.axis}: torque {torque * scale.torque:.4g} {torque_unit} is above the limit "
+                f"{limits.torque:g} {torque_unit}; all axes were stopped. Is the axis blocked, or "
+                "does the prior model have too little inertia?"
+            )
+        if not self.free and abs(target - position) > self.window:
+            error = (target - position) * scale.position
+            return (
+                f"{drive.axis}: following error {error:.4g} {unit} is above the limit "
+                f"{limits.following_error:g} {unit}; all axes were stopped. Does the axis move the "
+                "wrong way, or is it blocked?"
+            )
+        if abs(position - self.previous) > self.allowed:
+            cycles = max(1, self.allowed // self.step)
+            speed = (position - self.previous) * scale.position / (cycle_time * cycles)
+            return (
+                f"{drive.axis}: velocity {speed:.4g} {unit}/s is above the limit "
+                f"{limits.velocity:g} {unit}/s; all axes were stopped. Does the axis move the wrong "
+                "way?"
+            )
+        return (
+            f"{drive.axis}: node {drive.node_id} sent no heartbeat for "
+            f"{HEARTBEATS_MISSED * DRIVE_HEARTBEAT:.2g} s; all axes were stopped. Check its supply "
+            "and its cable."
+        )
+
+    def trouble(self) -> str:
+        """Return what the drive itself reports, in a sentence."""
+        axis, node_id = self.drive.axis, self.drive.node_id
+        if self.emergencies:
+            said = ", ".join(emergency_text(code) for code in self.emergencies[:3])
+            return (
+                f"{axis}: node {node_id} reports emergency {said}; all axes were stopped. Find the "
+                "cause in the drive's manual before the next start."
+            )
+        return (
+            f"{axis}: the drive left operation enabled: statusword 0x{self.statusword:04X} "
+            f"({self.state_words}); all axes were stopped. Look for its cause at the drive."
+        )
+
+
+def channel_of(drive: CanopenDrive, cycle_time: float, free: bool) -> Channel:
+    """Return the run-time state of an axis about to be moved, its limits in drive units."""
+    scale, limits = drive.scaling, drive.limits
+    return Channel(
+        drive,
+        free,
+        can.Message(arbitration_id=0x200 + drive.node_id, data=bytes(8), is_extended_id=False),
+        low=scale.position_units(limits.travel[0]),
+        high=scale.position_units(limits.travel[1]),
+        step=max(2, 1 + floor(min(limits.velocity * cycle_time / scale.velocity, _MOST_UNITS))),
+        torque=floor(min(limits.torque / scale.torque * (1 + 1e-12), _MOST_UNITS)),
+        window=floor(min(limits.following_error / scale.position * (1 + 1e-12), _MOST_UNITS)),
+    )

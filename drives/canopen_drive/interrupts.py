@@ -1,0 +1,36 @@
+"""Moments that nothing from the keyboard may cut short: stopping axes, putting drives back."""
+
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+@contextmanager
+def uninterrupted() -> Iterator[None]:
+    """Hold Ctrl-C and the request to end back until the block is done.
+
+    What came meanwhile acts afterwards, unless an error is on its way: then the program is ending
+    already, and the error says more.  In other threads than the main one signals never act, and
+    nothing is done.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    came: list[int] = []
+
+    def note(number: int, _frame: FrameType | None) -> None:
+        came.append(number)
+
+    before = {number: signal.signal(number, note) for number in SIGNALS}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, signal.SIG_DFL if handler is None else handler)
+        if came and sys.exc_info()[0] is None:
+            signal.raise_signal(came[0])
