@@ -1,6 +1,7 @@
 """One drive: its objects by SDO, its identity, its units."""
 
 import logging
+import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -205,6 +206,8 @@ class CanopenDrive:
             yield
         except SdoAbortedError as error:
             raise SdoAbortError(*place, error.code, verb) from None
+        except struct.error as error:
+            raise SdoError(*place, f"the drive's answer was too short: {error}.") from None
         except SdoCommunicationError as error:
             if "No SDO response" in str(error):
                 raise SdoTimeoutError(
@@ -274,6 +277,16 @@ class CanopenDrive:
                 f"{self.axis}: node {self.node_id} does not answer. Check its supply, its cable, its "
                 "node id and the bit rate."
             ) from None
+
+    def answers(self) -> bool:
+        """Whether the node answers at all."""
+        try:
+            self.read(objects.DEVICE_TYPE)
+        except SdoAbortError:
+            return True
+        except DrivesError:
+            return False
+        return True
 
     def _text(self, info: ObjectInfo) -> str:
         try:

@@ -1,5 +1,6 @@
 """All drives of a machine: connected, checked, and put back as they were."""
 
+import sys
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 
@@ -8,6 +9,7 @@ import can
 from drives.bus import CyclicLoad, check_cycle, open_bus, shortest_cycle
 from drives.canopen_drive import setup
 from drives.canopen_drive.drive import CanopenDrive
+from drives.canopen_drive.interrupts import uninterrupted
 from drives.canopen_drive.line import Line
 from drives.canopen_drive.motion import CanopenMotion
 from drives.cia402 import Mode
@@ -36,6 +38,8 @@ class CanopenGroup:
         self._drives, self._stop_requested = tuple(drives), stop_requested
         self.warnings: list[str] = []
         """What could not be put back, in words."""
+        self.late_cycles = 0
+        """Cycles of all motions so far that the host began more than half a cycle late."""
 
     @property
     def drives(self) -> tuple[CanopenDrive, ...]:
@@ -65,8 +69,7 @@ class CanopenGroup:
         """
         with ExitStack() as stack:
             for drive in self._drives:
-                changes = setup.TemporaryObjects(drive)
-                stack.callback(self._put_back, changes)
+                changes = self._changes(stack, drive)
                 for name in drive.profile.feed_forward:
                     parameter = drive.profile.parameters[name]
                     changes.change(ObjectInfo(parameter.object, parameter.type, name), 0)
@@ -96,13 +99,13 @@ class CanopenGroup:
         self._check(cycle_time, free)
         with ExitStack() as stack:
             for drive in self._drives:
-                changes = setup.TemporaryObjects(drive)
-                stack.callback(self._put_back, changes)
+                changes = self._changes(stack, drive)
                 mode = Mode.CYCLIC_TORQUE if drive.axis in free else Mode.CYCLIC_POSITION
                 setup.cycle(drive, cycle_time, changes)
+                setup.mode(drive, mode, changes)
                 setup.process_data(drive, changes)
-                drive.set_mode(mode)
-                setup.fail_safe(drive, changes)
+            for drive in self._drives:  # last, and so first to be put back: no heartbeat after that
+                setup.fail_safe(drive, self._changes(stack, drive))
             for drive in self._drives:
                 stack.callback(self._leave_operational, drive)
             for drive in self._drives:
@@ -110,12 +113,13 @@ class CanopenGroup:
             motion = CanopenMotion(
                 self.line, self._drives, cycle_time, frozenset(free), self._stop_requested
             )
+            stack.callback(self._note_late_cycles, motion)
             stack.callback(motion.end)
             try:
                 motion.begin()
                 yield motion
-            except BaseException:
-                motion.stop()
+            except BaseException as error:
+                motion.stop(error)
                 raise
 
     def _check(self, cycle_time: float, free: Collection[str]) -> None:
@@ -134,20 +138,39 @@ class CanopenGroup:
             drive.check_mode(Mode.CYCLIC_TORQUE if drive.axis in free else Mode.CYCLIC_POSITION)
             position = drive.read_position()
             if not low <= position <= high:
-                unit = "rad" if drive.axis_profile.kind == "rotary" else "m"
+                unit = drive.position_unit
                 raise LimitsError(
                     f"{drive.axis}: stands at {position:.4g} {unit}, outside its travel {low:g} to "
                     f"{high:g} {unit}. Move it back by hand or with the machine's own controller."
                 )
 
+    def _changes(self, stack: ExitStack, drive: CanopenDrive) -> setup.TemporaryObjects:
+        changes = setup.TemporaryObjects(drive)
+        stack.callback(self._put_back, changes)
+        return changes
+
     def _put_back(self, changes: setup.TemporaryObjects) -> None:
-        self.warnings += [f"could not be put back: {text}" for text in changes.put_back()]
+        """Put a drive's objects back; what fails joins the warnings and the error on its way."""
+        with uninterrupted():
+            failures = changes.put_back()
+        error = sys.exc_info()[1]
+        for text in failures:
+            self._warn(f"could not be put back: {text}")
+            if error is not None:
+                error.add_note(f"could not be put back: {text}")
+
+    def _note_late_cycles(self, motion: CanopenMotion) -> None:
+        self.late_cycles += motion.late_cycles
+
+    def _warn(self, text: str) -> None:
+        if text not in self.warnings:
+            self.warnings.append(text)
 
     def _leave_operational(self, drive: CanopenDrive) -> None:
         try:
             drive.node.nmt.send_command(ENTER_PRE_OPERATIONAL)
         except DrivesError as error:
-            self.warnings.append(f"{drive.axis}: {error}")
+            self._warn(f"{drive.axis}: {error}")
 
 
 @contextmanager
@@ -172,7 +195,7 @@ def connect(
     BusError
         If the bus can not be opened.
     NothingMovedError
-        If a node is absent, another device, in fault, or has no scales.
+        If a node is absent, another device, in fault, has no scales, or a limit does not fit them.
     """
     profiles: dict[str, DriveProfile] = {}
     for axis in machine.axes:
@@ -192,6 +215,7 @@ def connect(
         for drive in drives:
             drive.check_idle()
             drive.read_scaling()
+            drive.check_limits()
         yield CanopenGroup(line, machine, drives, stop_requested)
     finally:
         for node_id in list(line.nodes):

@@ -2,10 +2,14 @@
 
 from drives import objects
 from drives.canopen_drive.drive import CanopenDrive
-from drives.errors import DrivesError, NotSupportedError, SdoAbortError
+from drives.cia402 import Mode
+from drives.errors import DrivesError, NotSupportedError, SdoAbortError, SdoTimeoutError
 from drives.objects import ObjectAddress, ObjectInfo, type_bits
 
 PDO_OFF = 1 << 31
+COAST = 0
+QUICK_STOP_RAMP = {"disable": 2, "hold": 6}
+"""Values of 0x605A: slow down on the quick stop ramp, then switch on disabled, or stay."""
 SYNCHRONOUS = 1
 HOST_NODE_ID = 127
 HOST_HEARTBEAT = 0.05
@@ -49,19 +53,45 @@ class TemporaryObjects:
         self._before.append((info, before))
 
     def put_back(self) -> list[str]:
-        """Write all old values, newest first; return what failed, in words."""
+        """Write all old values, newest first; return what failed, in words.
+
+        A drive that does not answer any more is not asked for each of them.
+        """
         failures = []
         while self._before:
             info, before = self._before.pop()
             try:
                 self._drive.write(info, before)
+            except SdoTimeoutError as error:
+                failures.append(str(error))
+                if self._before and not self._drive.answers():
+                    left = dict.fromkeys(str(info.address) for info, _ in self._before)
+                    failures.append(
+                        f"{self._drive.axis}: node {self._drive.node_id} does not answer any more; "
+                        f"not put back: {', '.join(left)}. Switch the drive off and on."
+                    )
+                    self._before.clear()
             except DrivesError as error:
                 failures.append(str(error))
         return failures
 
 
+def mode(drive: CanopenDrive, wanted: Mode, changes: TemporaryObjects) -> None:
+    """Set the mode of operation, remembering the one before.
+
+    Raises
+    ------
+    NotSupportedError
+        If the drive does not confirm.
+    """
+    changes.note(objects.MODE, drive.read_int(objects.MODE))
+    drive.set_mode(wanted)
+
+
 def fail_safe(drive: CanopenDrive, changes: TemporaryObjects) -> None:
     """Make the drive stop by itself when the host's heartbeat is lost (0x1016, 0x6007, 0x1029).
+
+    A quick stop that would let the axis coast (0x605A = 0) becomes a ramp too.
 
     Raises
     ------
@@ -82,6 +112,10 @@ def fail_safe(drive: CanopenDrive, changes: TemporaryObjects) -> None:
     behaviour = drive.profile.error_behaviour
     if behaviour is not None and drive.read_optional(objects.ERROR_BEHAVIOUR) is not None:
         changes.change(objects.ERROR_BEHAVIOUR, behaviour)
+    if drive.read_optional(objects.QUICK_STOP_OPTION) == COAST:
+        changes.change(
+            objects.QUICK_STOP_OPTION, QUICK_STOP_RAMP[drive.profile.quick_stop_reaction]
+        )
     changes.change(objects.PRODUCER_HEARTBEAT, round(DRIVE_HEARTBEAT * 1000))
     changes.change(objects.CONSUMER_HEARTBEAT, (HOST_NODE_ID << 16) | round(HOST_LOST_AFTER * 1000))
 
@@ -154,15 +188,16 @@ def _map(
     count = ObjectInfo(ObjectAddress(mapping, 0), "UNSIGNED8", "number of mapped objects")
     old_identifier, old_count = drive.read_int(identifier), drive.read_int(count)
     old_entries = [drive.read_int(_entry(mapping, k + 1)) for k in range(old_count)]
-    # Put back in reverse: off, count 0, entries, count, type, on.  CiA 301, clause 7.5.2.36.
+    # Put back in reverse: off, type, count 0, entries, count, on.  CiA 301, clause 7.5.2.36.
+    off = (old_identifier | PDO_OFF) & 0xFFFFFFFF
     changes.note(identifier, old_identifier)
     changes.note(count, old_count)
     for k, old in enumerate(old_entries):
         changes.note(_entry(mapping, k + 1), old)
     changes.note(count, 0)
-    drive.write(identifier, (old_identifier | PDO_OFF) & 0xFFFFFFFF)
-    changes.note(identifier, (old_identifier | PDO_OFF) & 0xFFFFFFFF)
+    drive.write(identifier, off)
     changes.change(kind, SYNCHRONOUS)
+    changes.note(identifier, off)
     drive.write(count, 0)
     for k, info in enumerate(entries):
         address = info.address
