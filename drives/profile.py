@@ -29,6 +29,9 @@ from drives.objects import DataType, ObjectAddress
 from drives.units import Kind, parse_quantity
 
 MAX_PROFILE_BYTES = 1_000_000
+MAX_DEPTH = 30
+"""Of lists and mappings inside each other."""
+_LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 DIMENSIONS: dict[Kind, dict[str, str]] = {
     "rotary": {
@@ -378,8 +381,11 @@ def packaged(kind: Literal["drives", "machines"]) -> tuple[str, ...]:
 
 def _find(kind: Literal["drives", "machines"], name_or_path: str | Path) -> Path:
     path = Path(name_or_path)
-    if path.is_file():
-        return path
+    try:
+        if path.is_file():
+            return path
+    except (OSError, ValueError) as error:
+        raise ProfileError(str(path)[:80], f"is no name of a file ({error})") from None
     if path.suffix not in (".yaml", ".yml") and len(path.parts) == 1:
         packaged_file = files("profiles").joinpath(kind, f"{path.name}.yaml")
         with as_file(packaged_file) as found:
@@ -437,42 +443,63 @@ def _line(lines: Lines, location: tuple[str | int, ...]) -> int | None:
     return lines.get(location)
 
 
-def read_yaml(path: Path) -> tuple[Any, Lines]:
+def read_yaml(path: Path, largest: int = MAX_PROFILE_BYTES) -> tuple[Any, Lines]:
     """Return a YAML file's plain values, and the line on which each key or item stands.
+
+    Parameters
+    ----------
+    path
+        File, UTF-8.
+    largest
+        Bytes that are read at most.
 
     Raises
     ------
     ProfileError
-        If the file can not be read, is too large, is no YAML, has a key twice, or is no mapping.
+        If the file can not be read, is too large, is no YAML, uses aliases, has a key twice, or is
+        no mapping.
     """
     try:
         size = path.stat().st_size
-        if size > MAX_PROFILE_BYTES:
-            raise ProfileError(path, f"{size} bytes; at most {MAX_PROFILE_BYTES} are read")
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ProfileError(path, f"can not be read: {error}") from None
+        if size > largest:
+            raise ProfileError(path, f"is too large: {size} bytes; at most {largest} are read")
+        text = path.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise ProfileError(path, f"can not be read: {error.strerror}") from None
+    except UnicodeDecodeError as error:
+        line = error.object[: error.start].count(b"\n") + 1
+        raise ProfileError(path, "is not UTF-8 text; save it as UTF-8", line) from None
     lines: Lines = {}
     try:
-        root = yaml.compose(text, Loader=yaml.SafeLoader)
+        _refuse_aliases(text, path)
+        root = yaml.compose(text, Loader=_LOADER)
         if not isinstance(root, yaml.MappingNode):
             raise ProfileError(path, "is no mapping of keys to values", 1)
-        _note_lines(root, (), lines, path, 0)
-        return yaml.safe_load(text), lines
+        _note_lines(root, (), lines, path)
+        return yaml.load(text, Loader=_LOADER), lines  # noqa: S506 - the safe loader
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         raise ProfileError(
             path, f"is no YAML: {error.problem}", mark.line + 1 if mark else None
         ) from None
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise ProfileError(path, f"is no YAML: {error}") from None
+    except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
+        raise ProfileError(path, f"is no YAML: {' '.join(str(error).split())}") from None
 
 
-def _note_lines(
-    node: yaml.Node, place: tuple[str | int, ...], lines: Lines, path: Path, depth: int
-) -> None:
-    if depth > 32:
-        raise ProfileError(path, "is nested too deep", node.start_mark.line + 1)
+def _refuse_aliases(text: str, path: Path) -> None:
+    """A few lines of aliases can stand for more values than fit into a computer."""
+    depth = 0
+    for event in yaml.parse(text, Loader=_LOADER):
+        depth += isinstance(event, yaml.CollectionStartEvent)
+        depth -= isinstance(event, yaml.CollectionEndEvent)
+        line = event.start_mark.line + 1 if event.start_mark else None
+        if depth > MAX_DEPTH:
+            raise ProfileError(path, "is nested too deep", line)
+        if isinstance(event, yaml.AliasEvent):
+            raise ProfileError(path, "uses a YAML alias (*); write the values out", line)
+
+
+def _note_lines(node: yaml.Node, place: tuple[str | int, ...], lines: Lines, path: Path) -> None:
     lines.setdefault(place, node.start_mark.line + 1)
     if isinstance(node, yaml.MappingNode):
         for key, value in node.value:
@@ -482,7 +509,7 @@ def _note_lines(
                     path, f"{key.value} stands here a second time", key.start_mark.line + 1
                 )
             lines[here] = key.start_mark.line + 1
-            _note_lines(value, here, lines, path, depth + 1)
+            _note_lines(value, here, lines, path)
     elif isinstance(node, yaml.SequenceNode):
         for k, value in enumerate(node.value):
-            _note_lines(value, (*place, k), lines, path, depth + 1)
+            _note_lines(value, (*place, k), lines, path)

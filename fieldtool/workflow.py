@@ -372,7 +372,7 @@ def _session(
             left_out = not_imitated(group.line.can_bus)
             if left_out:
                 session.warn(
-                    "This machine is simulated. Not imitated: " + ", ".join(left_out) + "."
+                    "This machine is simulated. Not imitated: " + "; ".join(left_out) + "."
                 )
             yield session, group
     except BaseException as error:

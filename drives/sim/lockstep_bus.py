@@ -158,6 +158,9 @@ class LockstepBus(can.BusABC):
         If there is no such machine, or it can not be simulated.
     """
 
+    not_imitated = NOT_IMITATED
+    """What differs from a real bus, for whoever reports results; see :data:`NOT_IMITATED`."""
+
     def __init__(
         self,
         channel: Channel | None = None,

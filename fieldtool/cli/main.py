@@ -8,6 +8,8 @@ stopped by the user, machine safe.
 import json
 import signal
 import sys
+import tempfile
+import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import datetime
@@ -382,3 +384,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except KeyboardInterrupt:
         sys.stderr.write("fieldtool: stopped by the user\n")
         sys.exit(130)
+    except Exception as error:  # a defect of the tool: still one sentence, and nothing lost
+        report = (
+            Path(tempfile.gettempdir()) / f"fieldtool-defect-{datetime.now():%Y%m%d-%H%M%S}.txt"
+        )
+        report.write_text(traceback.format_exc(), encoding="utf-8")
+        sys.stderr.write(
+            f"fieldtool: unexpected {type(error).__name__}: {error}. All axes were stopped. This is a "
+            f"defect of fieldtool; please report it with {report}\n"
+        )
+        sys.exit(1)

@@ -4,7 +4,7 @@ The runner sees axes only through ``drives.api``; raw data go to the recording a
 also when it is cut short.
 """
 
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Iterable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from typing import Protocol
@@ -13,6 +13,7 @@ import numpy as np
 
 from drives.api import AxisLimits, Capture, FloatArray, Motion
 from drives.errors import SafetyStopError, StoppedError
+from fieldtool.errors import FieldtoolError, PlanRefusedError
 from fieldtool.experiment.plan import Sweep, SweepPlan, Tone, smooth_move, tone_blocks, transition
 from fieldtool.records.recording import Experiment, Segment
 
@@ -37,6 +38,17 @@ CHECK_SHARE = 0.05
 """Share of the velocity and acceleration limits that these moves use."""
 CHECK_MOVE = 0.02
 """Share of the travel by which each axis moves when its direction is checked."""
+CHECK_SLICE = 2
+"""Cycles after which the check looks at what the axes did."""
+CHECK_ASTRAY, CHECK_PUSHED = 1e-3, 10.0
+"""Share of its travel that an axis may go the wrong way or drift in the check; an axis that does
+not move itself may be pushed by the factor more."""
+CHECK_STARTED = 0.02
+"""Share of the check's move that an axis must have done when half of it was commanded."""
+LONGEST_MOVE = 600.0
+"""Seconds that crossing the travel may take at most."""
+HALVINGS = 6
+"""Times that a tone's amplitude is halved before the axis counts as overloaded by something else."""
 
 
 class Mover(Protocol):
@@ -95,65 +107,189 @@ class Axes:
 
 
 def check_directions(group: Mover, axes: Axes, cycle_time: float, keep: Keep) -> None:
-    """Move every axis a little and back, and see that it goes the right way.
+    """Move every axis a little and back, where it stands, and see that it goes the right way.
+
+    Each axis moves towards its centre.  It is judged every few cycles, long before its following
+    error leaves the limit: a loop of the wrong sign runs away as soon as it is enabled.
 
     Raises
     ------
+    PlanRefusedError
+        If the limits make positioning so slow that it would take too long; nothing moves.
     SafetyStopError
-        If an axis does not follow, or moves the wrong way, or its torque has the wrong sign.
+        If an axis does not follow, or moves the wrong way or by itself, or its torque has the
+        wrong sign.
     """
-    with group.motion(cycle_time) as motion:
-        _centre(motion, axes)
-        for k, name in enumerate(axes.names):
-            limits = axes.limits[k]
-            distance = CHECK_MOVE * (limits.travel[1] - limits.travel[0])
-            rest = max(2, round(CHECK_REST / cycle_time))
-            there = smooth_move(
-                distance,
-                CHECK_SHARE * limits.velocity,
-                CHECK_SHARE * limits.acceleration,
-                cycle_time,
-            )
-            path = np.concatenate(
-                [
-                    np.zeros(rest),
-                    there,
-                    np.full(rest, distance),
-                    distance - there,
-                    np.zeros(rest),
-                ]
-            )
-            targets = np.tile(axes.centre, (path.size, 1))
-            targets[:, k] += path
-            capture = _stream_once(motion, targets, name, keep)
-            _judge_direction(name, distance, capture, k, rest, there.size)
+    _check_pace(axes)
+    experiments: list[Experiment] = []
+    try:
+        with group.motion(cycle_time) as motion:
+            for k in range(len(axes.names)):
+                check = _DirectionCheck(axes, k, motion.position, cycle_time)
+                capture = _stream_check(motion, check, axes.names[k], experiments.append)
+                check.judge(capture)
+    except BaseException as error:
+        _keep_whatever_happens(experiments, keep, error)
+        raise
+    for experiment in experiments:  # the disk may be slow: not while axes wait for their SYNC
+        keep(experiment)
 
 
-def _judge_direction(
-    name: str, wanted: float, capture: Capture, k: int, rest: int, rows: int
+def _check_pace(axes: Axes) -> None:
+    for name, limits in zip(axes.names, axes.limits, strict=True):
+        way = limits.travel[1] - limits.travel[0]
+        velocity, acceleration = limits.velocity, limits.acceleration
+        duration = max(
+            1.875 * way / (MOVE_SHARE * velocity),
+            1.875 * CHECK_MOVE * way / (CHECK_SHARE * velocity),
+            np.sqrt(5.774 * way / (MOVE_SHARE * acceleration)),
+        )
+        if not duration <= LONGEST_MOVE:
+            raise PlanRefusedError(
+                f"{name}: with a velocity limit of {velocity:g}/s and an acceleration limit of "
+                f"{acceleration:g}/s2, moving across the travel {limits.travel[0]:g} to "
+                f"{limits.travel[1]:g} takes {duration:.3g} s, at most {LONGEST_MOVE:g} s are "
+                "allowed. Nothing was moved. Correct the limits in the machine profile."
+            )
+
+
+class _DirectionCheck:
+    """One axis' small move, in slices of a few cycles that are judged as they come."""
+
+    def __init__(self, axes: Axes, k: int, start: FloatArray, cycle_time: float) -> None:
+        self._axes, self._k, self._start = axes, k, start
+        limits = axes.limits[k]
+        size = CHECK_MOVE * (limits.travel[1] - limits.travel[0])
+        self._wanted = float(np.copysign(size, axes.centre[k] - start[k]))
+        self._rest = max(2, round(CHECK_REST / cycle_time))
+        there = smooth_move(
+            self._wanted,
+            CHECK_SHARE * limits.velocity,
+            CHECK_SHARE * limits.acceleration,
+            cycle_time,
+        )
+        self._rows = there.size
+        rest, away = np.zeros(self._rest), np.full(self._rest, self._wanted)
+        self._path = np.concatenate([rest, there, away, self._wanted - there, rest])
+        self._done = 0
+
+    def __call__(self, before: Capture | None) -> FloatArray | None:
+        """Return the next slice of targets; see ``drives.api.Source``."""
+        if before is not None:
+            self._watch(before)
+        if self._done >= self._path.size:
+            return None
+        part = self._path[self._done : self._done + CHECK_SLICE]
+        self._done += part.size
+        targets = np.tile(self._start, (part.size, 1))
+        targets[:, self._k] += part
+        return targets
+
+    def _watch(self, capture: Capture) -> None:
+        for j, name in enumerate(self._axes.names):
+            limits = self._axes.limits[j]
+            allowed = CHECK_ASTRAY * (limits.travel[1] - limits.travel[0])
+            moved = float(capture.position[-1, j] - self._start[j])
+            if j != self._k:
+                self._stay(name, moved, CHECK_PUSHED * allowed)
+            elif self._done <= self._rest:
+                self._stay(name, moved, allowed)
+            else:
+                self._follow(name, moved, allowed)
+
+    @staticmethod
+    def _stay(name: str, moved: float, allowed: float) -> None:
+        if abs(moved) > allowed:
+            raise SafetyStopError(
+                f"{name}: moved by {moved:.3g} while it was told to stand still; its power was cut "
+                "and all axes were stopped. Either the axis moves the wrong way (check the encoder's "
+                "direction and the motor's phases), or its loop is not stable, or it sags when its "
+                "brake opens.",
+                axis=name,
+                runaway=True,
+            )
+
+    def _follow(self, name: str, moved: float, allowed: float) -> None:
+        forward = moved * np.sign(self._wanted)
+        size = abs(self._wanted)
+        if forward < -allowed or forward > 1.5 * size:
+            raise SafetyStopError(
+                f"{name}: moves the wrong way or by itself: {self._wanted:.3g} was commanded, it moved "
+                f"{moved:.3g}; its power was cut and all axes were stopped. Check the encoder's "
+                "direction and the motor's phases.",
+                axis=name,
+                runaway=True,
+            )
+        half_way = self._rest + self._rows // 2 <= self._done < self._rest + self._rows
+        if half_way and forward < CHECK_STARTED * size:
+            raise SafetyStopError(
+                f"{name}: does not follow: half of {self._wanted:.3g} was commanded, it moved "
+                f"{moved:.3g}; its power was cut and all axes were stopped. Is it blocked or its brake "
+                "closed, or does the encoder not count?",
+                axis=name,
+                runaway=True,
+            )
+
+    def judge(self, capture: Capture) -> None:
+        """Raise SafetyStopError if the whole move was not what was commanded."""
+        name, wanted, k = self._axes.names[self._k], self._wanted, self._k
+        position, torque = capture.position[:, k], capture.torque[:, k]
+        moved = float(position[2 * self._rest + self._rows - 1] - position[0])
+        if not 0.5 < moved / wanted < 1.5:
+            raise SafetyStopError(
+                f"{name}: does not follow: {wanted:.3g} was commanded, it moved {moved:.3g}; all axes "
+                "were stopped. Is it blocked or its brake closed, or is the encoder's resolution "
+                "(0x608F) wrong?",
+                axis=name,
+            )
+        # Whatever swings behind the motor, half way the whole axis has the momentum that the motor
+        # gave.
+        rest, half = self._rest, self._rows // 2
+        push = torque[rest : rest + half] - torque[:rest].mean()
+        if float(push.sum()) * wanted < 0:
+            raise SafetyStopError(
+                f"{name}: the torque that starts a positive move is negative; all axes were stopped. "
+                "Check the drive's polarity (0x607E).",
+                axis=name,
+            )
+
+
+def _stream_check(motion: Motion, check: _DirectionCheck, driven: str, keep: Keep) -> Capture:
+    def experiment(capture: Capture, note: str = "") -> Experiment:
+        return Experiment(
+            name=f"direction check of {driven}",
+            kind="moves",
+            driven=(driven,),
+            free=(),
+            period=None,
+            time=_times(capture.rows, motion.cycle_time),
+            position=capture.position,
+            torque=capture.torque,
+            position_reference=capture.position_reference,
+            statusword=capture.statusword,
+            complete=not note,
+            note=note,
+        )
+
+    try:
+        capture = motion.stream(check)
+    except StoppedError as error:
+        if isinstance(error.capture, Capture) and error.capture.rows > 1:
+            keep(experiment(error.capture, str(error)))
+        raise
+    keep(experiment(capture))
+    return capture
+
+
+def _keep_whatever_happens(
+    experiments: Iterable[Experiment], keep: Keep, cause: BaseException
 ) -> None:
-    position, torque = capture.position[:, k], capture.torque[:, k]
-    moved = float(position[2 * rest + rows - 1] - position[0])
-    if moved * wanted < 0:
-        raise SafetyStopError(
-            f"{name}: moves the wrong way: {wanted:.3g} was commanded, it moved {moved:.3g}. Check the "
-            "encoder's direction and the motor's phases.",
-            axis=name,
-        )
-    if not 0.5 * wanted < moved < 1.5 * wanted:
-        raise SafetyStopError(
-            f"{name}: does not follow: {wanted:.3g} was commanded, it moved {moved:.3g}. Is it blocked "
-            "or its brake closed, or is the encoder's resolution (0x608F) wrong?",
-            axis=name,
-        )
-    # Whatever swings behind the motor, half way the whole axis has the momentum that the motor gave.
-    push = torque[rest : rest + rows // 2] - torque[:rest].mean()
-    if float(push.sum()) * wanted < 0:
-        raise SafetyStopError(
-            f"{name}: the torque that starts a positive move is negative. Check the drive's polarity "
-            "(0x607E).",
-            axis=name,
-        )
+    """Keep what was recorded before an error; that error counts, not one of the disk."""
+    try:
+        for experiment in experiments:
+            keep(experiment)
+    except FieldtoolError as error:
+        cause.add_note(f"what was recorded last could not be kept: {error}")
 
 
 def run_plan(
@@ -194,7 +330,8 @@ def run_plan(
                     capture = motion.stream(source)
                 except StoppedError as error:
                     if isinstance(error.capture, Capture) and error.capture.rows > 1:
-                        keep(source.experiment(error.capture, complete=False, note=str(error)))
+                        cut = source.experiment(error.capture, complete=False, note=str(error))
+                        _keep_whatever_happens([cut], keep, error)
                     raise
             machine_time += capture.rows * plan.cycle_time
             keep(source.experiment(capture))
@@ -283,12 +420,14 @@ class _SweepSource:
         before: Tone | None = None
         for k in range(self._first, len(self._sweep.tones)):
             tone = self._sweep.tones[k]
-            while True:
+            for _ in range(1 + HALVINGS):
                 smaller = yield from self._measure(tone, before, k)
                 before = tone
                 if smaller is None:
                     break
                 tone = smaller
+            else:
+                raise self._overload(tone)
             self.next_tone = k + 1
             if self._drifted:
                 break
@@ -301,7 +440,8 @@ class _SweepSource:
         """Settle and record one tone; return a smaller one if this one loads the axis too much."""
         blocks = tone_blocks(tone, before)
         capture: Capture = yield next(blocks)
-        if self._overloaded(capture):
+        comes_down = before is not None and before.amplitude > tone.amplitude
+        if not comes_down and self._overloaded(capture):
             return replace(tone, amplitude=tone.amplitude / 2)
         previous: _Phasors | None = None
         settled, count, start = False, 0, self._rows
@@ -351,6 +491,15 @@ class _SweepSource:
         return bool(
             np.abs(capture.torque[:, k]).max() > OVERLOAD * limits.torque
             or np.abs(capture.position[:, k] - self._axes.centre[k]).max() > OVERLOAD * room
+        )
+
+    def _overload(self, tone: Tone) -> SafetyStopError:
+        name = self._sweep.driven
+        return SafetyStopError(
+            f"{name}: at {tone.frequency:.3g} Hz its torque or its position stays above "
+            f"{100 * OVERLOAD:.0f} % of the limit however small the tone ({HALVINGS} times halved); "
+            "all axes were stopped. Does something else load it, or is its torque limit too low?",
+            axis=name,
         )
 
 
@@ -418,37 +567,6 @@ def _move(axes: Axes, k: int, distance: float, step: float) -> FloatArray:
     return smooth_move(
         distance, MOVE_SHARE * limits.velocity, MOVE_SHARE * limits.acceleration, step
     )
-
-
-def _once(motion: Motion, targets: FloatArray) -> Capture:
-    return motion.stream(lambda before: targets if before is None else None)
-
-
-def _stream_once(motion: Motion, targets: FloatArray, driven: str, keep: Keep) -> Capture:
-    def experiment(capture: Capture, note: str = "") -> Experiment:
-        return Experiment(
-            name=f"direction check of {driven}",
-            kind="moves",
-            driven=(driven,),
-            free=(),
-            period=None,
-            time=_times(capture.rows, motion.cycle_time),
-            position=capture.position,
-            torque=capture.torque,
-            position_reference=capture.position_reference,
-            statusword=capture.statusword,
-            complete=not note,
-            note=note,
-        )
-
-    try:
-        capture = _once(motion, targets)
-    except StoppedError as error:
-        if isinstance(error.capture, Capture) and error.capture.rows > 1:
-            keep(experiment(error.capture, str(error)))
-        raise
-    keep(experiment(capture))
-    return capture
 
 
 def _times(rows: int, step: float) -> FloatArray:

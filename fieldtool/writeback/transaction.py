@@ -1,10 +1,11 @@
 """Bring new parameters into the drives: all or nothing, read back, undoable."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from drives.canopen_drive import CanopenDrive
+from drives.errors import NotSupportedError, ProfileError
 from drives.parameters import (
     Backup,
     Change,
@@ -51,8 +52,12 @@ class WriteBack:
         )
 
 
-def take_backup(machine: str, drives: Sequence[CanopenDrive], path: Path) -> Backup:
-    """Back up every writable parameter of every drive to a file.
+def take_backup(machine: str, drives: Sequence[CanopenDrive], path: Path) -> Path:
+    """Back up every writable parameter of every drive to a file; return the file.
+
+    A backup that is there already is never overwritten: it holds what the drives held before the
+    first write.  Where it holds what the drives hold now, it is this backup; otherwise this one
+    gets the next free name, ``NAME-2.yaml`` and so on.
 
     Raises
     ------
@@ -60,19 +65,53 @@ def take_backup(machine: str, drives: Sequence[CanopenDrive], path: Path) -> Bac
         If the file can not be written; then nothing may be changed.
     """
     backup = back_up(machine, drives)
+    for candidate in _names(path):
+        try:
+            if candidate.exists():
+                if _holds(candidate, backup):
+                    return candidate
+                continue
+            save_backup(backup, candidate)
+        except (OSError, ProfileError) as error:
+            reason = error.strerror if isinstance(error, OSError) else str(error)
+            raise OutputError(
+                f"{candidate}: the backup of the drives' parameters can not be written ({reason}). "
+                "Nothing is written to the drives without it. Make room, or choose another folder."
+            ) from error
+        return candidate
+    raise OutputError(f"{path}: there are too many backups beside it. Choose another folder.")
+
+
+def _names(path: Path) -> Iterator[Path]:
+    yield path
+    for number in range(2, 1000):
+        yield path.with_name(f"{path.stem}-{number}{path.suffix}")
+
+
+def _holds(path: Path, backup: Backup) -> bool:
+    """Whether this file is a whole backup of the same drives with the same values."""
     try:
-        save_backup(backup, path)
-    except OSError as error:
-        raise OutputError(
-            f"{path}: the backup of the drives' parameters can not be written ({error.strerror}). "
-            "Nothing is written to the drives without it."
-        ) from error
-    return backup
+        return load_backup(path).drives == backup.drives
+    except ProfileError:
+        return False
 
 
 def changes_for(drives: Sequence[CanopenDrive], tuning: Tuning) -> tuple[Change, ...]:
-    """Return what a tuning would change, in the order of writing; nothing is written."""
+    """Return what a tuning would change, in the order of writing; nothing is written.
+
+    Raises
+    ------
+    NotSupportedError
+        If the tuning names an axis or a parameter that the machine does not have, or a value does
+        not fit.
+    """
     by_axis = {drive.axis: drive for drive in drives}
+    unknown = [axis.axis for axis in tuning.axes if axis.axis not in by_axis]
+    if unknown:
+        raise NotSupportedError(
+            f"the tuning is for axis {', '.join(unknown)}, which this machine does not have; its axes "
+            f"are {', '.join(by_axis)}. Nothing was written."
+        )
     changes: list[Change] = []
     for axis in tuning.axes:
         changes += planned_changes(by_axis[axis.axis], axis.parameters)
@@ -98,7 +137,7 @@ def apply(
     tuning
         New parameters.
     backup_path
-        File for the backup, written before the first change.
+        File for the backup, written before the first change; see :func:`take_backup`.
     confirm
         Sees old and new values and says whether to write.
     keep
@@ -107,12 +146,12 @@ def apply(
     Raises
     ------
     WriteBackError, WriteBackMixedError
-        As ``drives.parameters.write``.
+        As ``drives.parameters.write``; and if not every drive stores the parameters.
     OutputError
         If the backup can not be written; nothing was changed.
     """
-    take_backup(machine, drives, backup_path)
     changes = changes_for(drives, tuning)
+    backup_path = take_backup(machine, drives, backup_path)
     if not confirm(changes):
         return WriteBack((), changes, in_memory=False, stored=False, backup=backup_path)
     written = write(drives, changes)

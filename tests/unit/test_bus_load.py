@@ -115,7 +115,6 @@ def test_real_and_simulated_buses_tell_their_own_time() -> None:
         plain.shutdown()
 
 
-@pytest.mark.xfail(strict=True, reason="LockstepBus lacks the attribute `not_imitated`")
 def test_a_simulated_bus_says_what_it_does_not_imitate() -> None:
     simulated = open_bus(BusProfile(interface="fieldsim", channel="turntable-arm"))
     try:

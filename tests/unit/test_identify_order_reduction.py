@@ -159,9 +159,15 @@ def test_derivatives_agree_with_differences(known, rng):
 
 
 def test_standard_errors_agree_with_repeated_noise(rng):
-    model = exact_modes.random_machine(rng, 2, [2, 3])
-    axes, cross = bench.machine_inputs(model, spectra(model))
     relative = 1e-6
+    closest = 0.0
+    while closest < 1e3 * relative:  # the law holds where noise does not swap neighbouring modes
+        model = exact_modes.random_machine(rng, 2, [2, 3])
+        axes, cross = bench.machine_inputs(model, spectra(model))
+        closest = min(
+            float(np.min(np.diff(np.sort([*s.resonances[1:], *s.antiresonances])) / s.resonances[-1]))
+            for s in (axis.spectrum for axis in axes)
+        )
     noisy = []
     for axis in axes:
         s = axis.spectrum
