@@ -476,7 +476,7 @@ def read_yaml(path: Path, largest: int = MAX_PROFILE_BYTES) -> tuple[Any, Lines]
         if not isinstance(root, yaml.MappingNode):
             raise ProfileError(path, "is no mapping of keys to values", 1)
         _note_lines(root, (), lines, path)
-        return yaml.load(text, Loader=_LOADER), lines  # noqa: S506 - the safe loader
+        return yaml.load(text, Loader=_LOADER), lines
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         raise ProfileError(

@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
+from time import monotonic
 from types import FrameType
 from typing import Annotated, Any
 
@@ -66,6 +67,10 @@ EXIT_CODES: tuple[tuple[type[Exception], int], ...] = (
     (DrivesError, 3),
 )
 
+ASKED_WITHIN = 0.5
+"""Seconds: a motion asks for a stop so often, at least."""
+STOPPED_AT_REST = "stopped by the user; no axis was moving, all are disabled."
+
 Machine = Annotated[str, typer.Argument(help="Name of a machine profile, or path of its file.")]
 Out = Annotated[
     Path | None, typer.Option("--out", help="Session folder; a new one in sessions/ otherwise.")
@@ -86,19 +91,45 @@ Motor = Annotated[
 
 
 class _StopKey:
-    """Ctrl-C asks for a stop; the motion ends in its next cycle and leaves the machine safe."""
+    """Ctrl-C asks for a stop.
+
+    While axes move, the motion asks for it in every cycle and ends in a stop of all axes; at any
+    other time the work in hand is broken off at once, and what it had changed is put back.
+    """
 
     def __init__(self) -> None:
         self.pressed = False
+        self._asked = -ASKED_WITHIN
 
     def __call__(self) -> bool:
+        self._asked = monotonic()
         return self.pressed
 
     def on_signal(self, _number: int, _frame: FrameType | None) -> None:
         if self.pressed:
             return
         self.pressed = True
-        sys.stderr.write("\nStopping all axes ...\n")
+        if monotonic() - self._asked <= ASKED_WITHIN:
+            sys.stderr.write("\nStopping all axes ...\n")
+            return
+        raise UserStopError(STOPPED_AT_REST)
+
+    def check(self) -> None:
+        """Raise UserStopError if it was pressed; between two stages, with all axes disabled."""
+        if self.pressed:
+            raise UserStopError(STOPPED_AT_REST)
+
+
+class _StoppableScreen:
+    """A screen at which a session ends between two stages, if the user asked for it."""
+
+    def __init__(self, screen: workflow.Screen, key: _StopKey) -> None:
+        self._screen, self._key = screen, key
+        self.say, self.plan, self.progress = screen.say, screen.plan, screen.progress
+
+    def stage(self, title: str) -> None:
+        self._key.check()
+        self._screen.stage(title)
 
 
 @contextmanager
@@ -137,8 +168,9 @@ def _options(plan: str, write: bool, store: bool, motor: str) -> workflow.Option
     )
 
 
-def _asker(console: Console, yes: bool) -> Callable[[Sequence[Change]], bool]:
+def _asker(console: Console, yes: bool, key: _StopKey) -> Callable[[Sequence[Change]], bool]:
     def ask(changes: Sequence[Change]) -> bool:
+        key.check()
         if yes:
             return True
         rows = [
@@ -187,8 +219,8 @@ def run(
             machine,
             _folder(out, machine),
             options,
-            screen=screen,
-            confirm=_asker(console, yes),
+            screen=_StoppableScreen(screen, key),
+            confirm=_asker(console, yes, key),
             stop_requested=key,
         )
     show_result(console, result)
@@ -220,7 +252,9 @@ def measure(
     console = _console(as_json)
     folder = _folder(out, machine)
     with _stop_key() as key, TerminalScreen(console) as screen:
-        seconds = workflow.measure(machine, folder, screen=screen, stop_requested=key)
+        seconds = workflow.measure(
+            machine, folder, screen=_StoppableScreen(screen, key), stop_requested=key
+        )
     console.print(f"{seconds:.0f} s of machine time; the recording is in {folder}")
     if as_json:
         _print_json({"folder": str(folder), "time": {"machine_s": seconds}})
@@ -304,8 +338,9 @@ def write(
     """Write the session folder's tuning into the drives: backup, write, read back."""
     console = _console(False)
     options = workflow.Options(write=True, store=store)
-    with TerminalScreen(console) as screen:
-        workflow.write(folder, options, _asker(console, yes), screen=screen)
+    with _stop_key() as key, TerminalScreen(console) as screen:
+        stoppable = _StoppableScreen(screen, key)
+        workflow.write(folder, options, _asker(console, yes, key), screen=stoppable)
 
 
 @app.command()
@@ -320,9 +355,16 @@ def restore(
     if machine is None:
         folder = backup if backup.is_dir() else backup.parent
         machine = str(folder / "machine.yaml")
-    written = workflow.restore(machine, backup, store)
+    with _stop_key():
+        written = workflow.restore(machine, backup, store)
     console = _console(False)
     console.print(f"{len(written)} parameters differed and were restored; all were read back.")
+    console.print(
+        "They are stored too: they survive a power cycle."
+        if store
+        else "They are in the drives' working memory only: a power cycle brings back what was stored. "
+        "Use --store to keep them."
+    )
 
 
 @app.command("import")
@@ -380,6 +422,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         app(args=None if arguments is None else list(arguments))
     except (FieldtoolError, DrivesError) as error:
         sys.stderr.write(f"fieldtool: {error}\n")
+        for note in getattr(error, "__notes__", ()):
+            sys.stderr.write(f"fieldtool: {note}\n")
         sys.exit(exit_code(error))
     except KeyboardInterrupt:
         sys.stderr.write("fieldtool: stopped by the user\n")

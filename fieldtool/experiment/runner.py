@@ -440,8 +440,8 @@ class _SweepSource:
         """Settle and record one tone; return a smaller one if this one loads the axis too much."""
         blocks = tone_blocks(tone, before)
         capture: Capture = yield next(blocks)
-        comes_down = before is not None and before.amplitude > tone.amplitude
-        if not comes_down and self._overloaded(capture):
+        halved = before is not None and tone == replace(before, amplitude=before.amplitude / 2)
+        if not halved and self._overloaded(capture):  # the way down from an overload is not judged
             return replace(tone, amplitude=tone.amplitude / 2)
         previous: _Phasors | None = None
         settled, count, start = False, 0, self._rows

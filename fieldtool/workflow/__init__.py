@@ -1,0 +1,36 @@
+"""The composition root: one function a session, stages in order.
+
+This is the only place that knows all stages, and, with criticism, the only one that knows that a
+simulation may stand behind the bus.
+"""
+
+from fieldtool.workflow.models import prior_model, truth_model
+from fieldtool.workflow.recordings import compare, export_folder, import_folder, simulate
+from fieldtool.workflow.session import (
+    Options,
+    Quiet,
+    Screen,
+    SessionResult,
+    parameter_table,
+)
+from fieldtool.workflow.stages import identify, measure, redesign, restore, run, write
+
+__all__ = [
+    "Options",
+    "Quiet",
+    "Screen",
+    "SessionResult",
+    "compare",
+    "export_folder",
+    "identify",
+    "import_folder",
+    "measure",
+    "parameter_table",
+    "prior_model",
+    "redesign",
+    "restore",
+    "run",
+    "simulate",
+    "truth_model",
+    "write",
+]

@@ -1,0 +1,119 @@
+"""Measure with the classic plan: two passes, checked before motion, raw data kept as it comes."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from drives.canopen_drive import CanopenGroup
+from drives.parameters import read_parameters
+from drives.profile import MachineProfile
+from fieldtool.errors import IdentificationError
+from fieldtool.experiment.classic import chosen_cycle_time, classic_plan, refined_plan
+from fieldtool.experiment.forecast import Setting, forecast
+from fieldtool.experiment.runner import Axes, check_directions, run_plan
+from fieldtool.frf.held_targets import LINEAR_TARGETS
+from fieldtool.identify.classic import without_friction
+from fieldtool.identify.recorded import identify_recording
+from fieldtool.records.closed_loop import loop_from_parameters
+from fieldtool.records.model import MachineModel
+from fieldtool.records.recording import (
+    AxisInfo,
+    Controller,
+    Experiment,
+    Recording,
+    RecordingWriter,
+)
+from fieldtool.workflow.models import prior_model
+from fieldtool.workflow.session import Session
+from fieldtool.writeback.transaction import take_backup
+
+SETTLE_GUESS = 8.0
+"""Seconds that a tone takes to settle, for the first estimate of a plan's duration."""
+
+
+def measured(session: Session, group: CanopenGroup) -> float:
+    """Back the parameters up, measure both passes, and return the seconds of excitation."""
+    machine, folder = session.machine, session.folder
+    take_backup(machine.name, group.drives, folder.parameters_before)
+    with group.without_feed_forward():
+        return _measure_both_passes(session, group)
+
+
+def _measure_both_passes(session: Session, group: CanopenGroup) -> float:
+    machine, screen, folder = session.machine, session.screen, session.folder
+    setting = _setting(machine, group, prior_model(machine))
+    cycle_time = chosen_cycle_time(setting.model, group.shortest_cycle)
+    plan = classic_plan(setting, [axis.name for axis in machine.axes if axis.may_float], cycle_time)
+    screen.stage("Plan the first pass")
+    expected = forecast(plan, setting)
+    screen.plan(plan, expected, plan.expected_duration(SETTLE_GUESS))
+    for note in plan.notes:
+        screen.say(note)
+    axes = Axes(group.axes, setting.limits, setting.centre)
+    with RecordingWriter(folder.recording, _header(machine, group, cycle_time)) as recording:
+
+        def keep(experiment: Experiment) -> None:
+            recording.append(experiment)
+            folder.note("recorded", experiment=experiment.name, complete=experiment.complete)
+
+        screen.stage("Check that every axis moves the right way")
+        check_directions(group, axes, cycle_time, keep)
+        screen.stage("Measure, first pass: an even grid over the band of the prior model")
+        machine_time = run_plan(group, plan, axes, keep, screen.progress)
+        screen.stage("Find the modes, and plan the second pass around them")
+        try:
+            found = identify_recording(recording.recording, {}, setting.model, {})
+        except IdentificationError as error:
+            session.warn(f"The first pass alone can not be identified ({error})")
+            return machine_time
+        now_known = replace(setting, model=without_friction(found.model))
+        second = refined_plan(now_known, found.damping_ratios, cycle_time)
+        if not second.sweeps:
+            return machine_time
+        screen.plan(second, forecast(second, now_known), second.expected_duration(SETTLE_GUESS))
+        screen.stage("Measure, second pass: at and beside every mode")
+        machine_time += run_plan(group, second, axes, keep, screen.progress)
+    return machine_time
+
+
+def _setting(machine: MachineProfile, group: CanopenGroup, model: MachineModel) -> Setting:
+    return Setting(
+        model,
+        tuple(loop_from_parameters(read_parameters(drive)) for drive in group.drives),
+        tuple(drive.limits for drive in group.drives),
+        np.array([sum(axis.limits.travel) / 2 for axis in machine.axes]),
+    )
+
+
+def _header(machine: MachineProfile, group: CanopenGroup, cycle_time: float) -> Recording:
+    axes = []
+    for axis, drive in zip(machine.axes, group.drives, strict=True):
+        values = read_parameters(drive)
+        rotary = axis.kind == "rotary"
+        axes.append(
+            AxisInfo(
+                name=axis.name,
+                kind=axis.kind,
+                masses=len(axis.prior.masses),
+                motor_inertia=axis.motor_inertia.value if axis.motor_inertia else None,
+                rated_torque=drive.rated_torque,
+                encoder_counts_per_rev=(2 * np.pi / drive.scaling.position if rotary else None),
+                controller=Controller(
+                    values["position_p"],
+                    values["velocity_p"],
+                    values["velocity_i"],
+                    axis.limits.torque,
+                ),
+                torque_unit="N m" if rotary else "N",
+                position_unit="rad" if rotary else "m",
+            )
+        )
+    source = {"machine": machine.name}
+    linear = [
+        f"{d.axis}={d.profile.torque_lag!r}"
+        for d in group.drives
+        if d.profile.interpolation == "linear"
+    ]
+    if linear:
+        source[LINEAR_TARGETS] = " ".join(linear)
+    return Recording(cycle_time, tuple(axes), (), machine.description, source)

@@ -1,0 +1,60 @@
+"""Models that a machine profile holds: as last accepted, and, where simulated, as it really is."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from drives.profile import MachineProfile
+from fieldtool.errors import PlanRefusedError
+from fieldtool.records.model import AxisModel, Coupling, Estimate, MachineModel
+from fieldtool.workflow.session import Options
+
+
+def prior_model(machine: MachineProfile) -> MachineModel:
+    """Return the machine as last accepted."""
+    return _model([axis.prior for axis in machine.axes], machine.couplings, machine)
+
+
+def truth_model(machine: MachineProfile) -> MachineModel | None:
+    """Return what a simulated machine really is; None where the machine is real."""
+    if machine.simulation is None or machine.bus.interface != "fieldsim":
+        return None
+    return _model(machine.simulation.axes, machine.simulation.couplings, machine)
+
+
+def data_sheet_masses(machine: MachineProfile, options: Options) -> dict[str, Estimate]:
+    """Return the motors' masses from their data sheets, where they are to be used."""
+    if options.motor_inertia == "measured":
+        return {}
+    missing = [axis.name for axis in machine.axes if axis.motor_inertia is None]
+    if missing:
+        raise PlanRefusedError(
+            f"{', '.join(missing)}: the machine profile has no motor_inertia, which "
+            "--motor-inertia data-sheet needs. Add it from the motor's data sheet."
+        )
+    return {
+        axis.name: Estimate(m.value, m.value * m.tolerance / np.sqrt(3))
+        for axis in machine.axes
+        if (m := axis.motor_inertia) is not None
+    }
+
+
+def _model(chains: Any, couplings: Any, machine: MachineProfile) -> MachineModel:
+    def exact(values: Sequence[float]) -> tuple[Estimate, ...]:
+        return tuple(Estimate(v) for v in values)
+
+    return MachineModel(
+        tuple(
+            AxisModel(
+                axis.name,
+                axis.kind,
+                exact(chain.masses),
+                exact(chain.springs),
+                exact(chain.dampers),
+                Estimate(chain.viscous_friction),
+            )
+            for axis, chain in zip(machine.axes, chains, strict=True)
+        ),
+        tuple(Coupling(c.axes, c.value) for c in couplings),
+    )

@@ -1,0 +1,88 @@
+"""Recordings from and to other tools, the check on a hidden signal, and simulated machines on a bus."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+from drives.bus import open_bus
+from drives.profile import BusProfile, load_machine
+from fieldtool.identify.prediction import LoadPrediction, predict_load
+from fieldtool.identify.recorded import identify_recording
+from fieldtool.records.csv_folder import read_folder, write_folder
+from fieldtool.records.model import MachineModel
+from fieldtool.records.model_file import read_model
+from fieldtool.records.recording import (
+    Recording,
+    load,
+    save,
+)
+
+
+def import_folder(folder: Path, out: Path) -> Recording:
+    """Turn a folder with ``recording.yaml`` and CSV files into a recording file.
+
+    Raises
+    ------
+    FileFormatError
+        If something in the folder is wrong: file, line, column.
+    OutputError
+        If the recording can not be written.
+    """
+    recording = read_folder(folder)
+    save(recording, out)
+    return recording
+
+
+def export_folder(recording: Path, folder: Path) -> None:
+    """Turn a recording file into a folder with ``recording.yaml`` and CSV files."""
+    write_folder(load(recording), folder)
+
+
+def compare(
+    recording: Path, model: Path | None, band: tuple[float, float]
+) -> tuple[LoadPrediction, ...]:
+    """Predict the load side of a single axis, which no fit has seen, and compare.
+
+    Parameters
+    ----------
+    recording
+        With a load-side signal.
+    model
+        ``model.yaml``; None identifies the motor side of the recording first.
+    band
+        Hz.
+    """
+    data = load(recording)
+    machine = read_model(model) if model else identify_recording(data, {}).model
+    return predict_load(machine, _delay_of(machine), data, band=band)
+
+
+def _delay_of(model: MachineModel) -> float:
+    for effect in model.effects:
+        if effect.get("effect") == "measurement_delay":
+            return float(effect["parameters"]["delay"]["value"])
+    return 0.0
+
+
+def simulate(
+    machine: str, interface: str, channel: str, stop_requested: Callable[[], bool]
+) -> None:
+    """Serve a simulated machine's nodes in real time on a bus until told to stop.
+
+    Raises
+    ------
+    ProfileError
+        If the machine has no `simulation` section.
+    BusError
+        If the bus can not be opened.
+    """
+    from drives.sim.machine import simulated_machine
+    from drives.sim.running import RunningMachine
+    from drives.sim.serve import serve
+
+    profile = load_machine(machine)
+    running = RunningMachine(simulated_machine(profile))
+    bus = open_bus(BusProfile(interface=interface, channel=channel, bitrate=profile.bus.bitrate))
+    try:
+        serve(running, bus, stop_requested)
+    finally:
+        bus.shutdown()

@@ -1,0 +1,186 @@
+"""What the stages of one session share: options, screen, folder, connected drives."""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Literal, Protocol
+
+import yaml
+
+from drives.bus import not_imitated
+from drives.canopen_drive import CanopenGroup, connect
+from drives.parameters import Change, Written
+from drives.profile import MachineProfile, load_machine
+from fieldtool.design.tuning import Tuning
+from fieldtool.experiment.forecast import AxisForecast
+from fieldtool.experiment.plan import SweepPlan
+from fieldtool.experiment.runner import Progress
+from fieldtool.identify.recorded import Identified
+from fieldtool.records.model import MachineModel
+from fieldtool.records.session_folder import SessionFolder
+from fieldtool.records.yaml_file import write_yaml
+from fieldtool.writeback.transaction import WriteBack
+
+PlanName = Literal["classic"]
+
+
+class Screen(Protocol):
+    """What a session tells while it runs; the command line shows it, scripts may ignore it."""
+
+    def stage(self, title: str) -> None:
+        """A new stage begins."""
+
+    def say(self, sentence: str) -> None:
+        """Something that a person should know."""
+
+    def plan(self, plan: SweepPlan, expected: Sequence[AxisForecast], duration: float) -> None:
+        """A plan was made and checked; nothing of it has moved yet."""
+
+    def progress(self, progress: Progress) -> None:
+        """A block of a sweep ended."""
+
+
+class Quiet:
+    """A screen that shows nothing."""
+
+    def stage(self, title: str) -> None:
+        """Show nothing."""
+
+    def say(self, sentence: str) -> None:
+        """Show nothing."""
+
+    def plan(self, plan: SweepPlan, expected: Sequence[AxisForecast], duration: float) -> None:
+        """Show nothing."""
+
+    def progress(self, progress: Progress) -> None:
+        """Show nothing."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """How a session is run."""
+
+    plan: PlanName = "classic"
+    write: bool = False
+    store: bool = False
+    motor_inertia: Literal["measured", "data sheet"] = "measured"
+
+
+@dataclass(frozen=True)
+class SessionResult:
+    """What a session found and did."""
+
+    folder: Path
+    model: MachineModel
+    identified: Identified
+    tuning: Tuning
+    write_back: WriteBack | None
+    truth: MachineModel | None
+    """What the simulated machine really is; None for a real one."""
+    machine_time: float
+    """Seconds of excitation."""
+    wall_time: float
+    """Seconds."""
+    warnings: tuple[str, ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values, as ``--json`` prints them."""
+        return {
+            "model": self.model.as_dict(),
+            "truth": self.truth.as_dict() if self.truth else None,
+            "time": {"machine_s": self.machine_time, "wall_s": self.wall_time},
+            "parameters": parameter_table(self.write_back),
+            "warnings": list(self.warnings),
+            "folder": str(self.folder),
+        }
+
+
+@dataclass
+class Session:
+    """What the stages of one session share."""
+
+    folder: SessionFolder
+    machine: MachineProfile
+    screen: Screen
+    warnings: list[str] = field(default_factory=list)
+
+    def warn(self, sentence: str) -> None:
+        """Show a sentence and keep it for the result; the same one only once."""
+        if sentence not in self.warnings:
+            self.warnings.append(sentence)
+            self.screen.say(sentence)
+            self.folder.note("warning", text=sentence)
+
+
+def never() -> bool:
+    """Return False: nobody asks for a stop."""
+    return False
+
+
+@contextmanager
+def open_session(
+    machine: str | Path | MachineProfile,
+    out: Path,
+    screen: Screen | None,
+    stop_requested: Callable[[], bool],
+    keep_profile: bool = False,
+) -> Iterator[tuple[Session, CanopenGroup]]:
+    """Make the session folder, connect to the machine, and note how it ended.
+
+    Parameters
+    ----------
+    machine
+        Name or file of a machine profile, or the profile.
+    out
+        Session folder; made if missing.
+    screen
+        Is told what happens; None shows nothing.
+    stop_requested
+        Asked in every cycle of a motion.
+    keep_profile
+        Leave the folder's machine profile as it is.
+    """
+    profile = machine if isinstance(machine, MachineProfile) else load_machine(machine)
+    folder = SessionFolder.create(out)
+    if not keep_profile:
+        write_yaml(folder.machine, yaml.safe_load(profile.path.read_text(encoding="utf-8")))
+    session = Session(folder, profile, screen or Quiet())
+    folder.note("session", machine=profile.name, version=version("fieldtool"))
+    session.screen.stage(f"Connect to {profile.name}")
+    try:
+        with connect(profile, stop_requested=stop_requested) as group:
+            for drive in group.drives:
+                identity = drive.identity
+                folder.note("drive", axis=drive.axis, node=drive.node_id, name=identity.device_name)
+            left_out = not_imitated(group.line.can_bus)
+            if left_out:
+                session.warn(
+                    "This machine is simulated. Not imitated: " + "; ".join(left_out) + "."
+                )
+            yield session, group
+    except BaseException as error:
+        folder.note("ended", error=type(error).__name__, text=str(error))
+        raise
+    folder.note("ended")
+
+
+def parameter_table(write_back: WriteBack | None) -> list[dict[str, Any]]:
+    """Return one row a parameter: axis, name, unit, before, after, read_back (null: not written)."""
+    if write_back is None:
+        return []
+    read_back = {(w.change.axis, w.change.name): w for w in write_back.written}
+
+    def row(change: Change) -> dict[str, Any]:
+        written: Written | None = read_back.get((change.axis, change.name))
+        return {
+            "axis": change.axis,
+            "name": change.name,
+            "unit": change.unit,
+            "before": change.before,
+            "after": change.after,
+            "read_back": written.read_back if written else None,
+        }
+
+    return [row(change) for change in write_back.changes]

@@ -1,0 +1,239 @@
+"""Whole sessions, and each stage alone: from the session folder to the session folder."""
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+from drives.canopen_drive import CanopenGroup, connect
+from drives.parameters import Change, HeldObject, load_backup
+from drives.profile import MachineProfile, load_machine
+from fieldtool.design.tuning import Tuning, design
+from fieldtool.design.tuning_file import read_tuning, tuning_as_dict
+from fieldtool.errors import FileFormatError
+from fieldtool.frf.response import save_responses
+from fieldtool.identify.recorded import Identified, identify_recording
+from fieldtool.records.model import Estimate, MachineModel
+from fieldtool.records.model_file import read_model, write_model
+from fieldtool.records.recording import (
+    load,
+)
+from fieldtool.records.session_folder import SessionFolder
+from fieldtool.records.yaml_file import write_yaml
+from fieldtool.report.pictures import draw_responses
+from fieldtool.workflow.measuring import measured
+from fieldtool.workflow.models import data_sheet_masses, prior_model, truth_model
+from fieldtool.workflow.session import (
+    Options,
+    Screen,
+    Session,
+    SessionResult,
+    never,
+    open_session,
+    parameter_table,
+)
+from fieldtool.writeback.transaction import WriteBack, apply, changes_for, undo
+
+Confirm = Callable[[Sequence[Change]], bool]
+
+
+def run(
+    machine: str | Path | MachineProfile,
+    out: Path,
+    options: Options | None = None,
+    *,
+    screen: Screen | None = None,
+    confirm: Confirm = lambda _: False,
+    stop_requested: Callable[[], bool] = never,
+) -> SessionResult:
+    """Measure, identify, design and, if wanted, write back.
+
+    Parameters
+    ----------
+    machine
+        Name or file of a machine profile, or the profile.
+    out
+        Session folder; made if missing.
+    options
+        Plan, and whether to write.
+    screen
+        Is told what happens.
+    confirm
+        Sees old and new parameters before the first write, and says whether to go on.
+    stop_requested
+        Asked in every cycle of a motion.
+
+    Raises
+    ------
+    DrivesError, FieldtoolError
+        With one sentence for a person.  Whatever was measured is in the session folder.
+    """
+    options = options or Options()
+    begin = time.perf_counter()
+    with open_session(machine, out, screen, stop_requested) as (session, group):
+        machine_time = measured(session, group)
+        identified = _identify(session, options)
+        session.screen.stage("Design new controller parameters")
+        tuning = _design(session.folder, identified.model)
+        write_back = _write(session, group, tuning, options, confirm)
+        session.warnings += group.warnings
+    return SessionResult(
+        session.folder.path,
+        identified.model,
+        identified,
+        tuning,
+        write_back,
+        truth_model(session.machine),
+        machine_time,
+        time.perf_counter() - begin,
+        tuple(session.warnings),
+    )
+
+
+def measure(
+    machine: str | Path | MachineProfile,
+    out: Path,
+    *,
+    screen: Screen | None = None,
+    stop_requested: Callable[[], bool] = never,
+) -> float:
+    """Run both passes of the classic plan; return the seconds of excitation.
+
+    Raises
+    ------
+    DrivesError, FieldtoolError
+        As :func:`run`.
+    """
+    with open_session(machine, out, screen, stop_requested) as (session, group):
+        return measured(session, group)
+
+
+def identify(
+    source: Path, options: Options | None = None, masses: Mapping[str, int] | None = None
+) -> Identified:
+    """Identify from a session folder or a recording; in a session folder the model is kept.
+
+    Raises
+    ------
+    FileFormatError
+        If there is no recording.
+    IdentificationError
+        If the data do not allow it.
+    """
+    options = options or Options()
+    folder = SessionFolder(source) if source.is_dir() else None
+    recording = load(folder.recording if folder else source)
+    prior = None
+    motors: dict[str, Estimate] = {}
+    if folder and folder.machine.is_file():
+        machine = load_machine(folder.machine)
+        prior, motors = prior_model(machine), data_sheet_masses(machine, options)
+    identified = identify_recording(recording, masses or {}, prior, motors)
+    if folder:
+        _keep(folder, identified, prior)
+    return identified
+
+
+def redesign(folder_path: Path) -> Tuning:
+    """Design parameters from a session folder's model and keep them there.
+
+    Raises
+    ------
+    FileFormatError
+        If there is no model.
+    """
+    folder = SessionFolder(folder_path)
+    return _design(folder, read_model(folder.model))
+
+
+def write(
+    folder_path: Path,
+    options: Options,
+    confirm: Confirm,
+    *,
+    screen: Screen | None = None,
+) -> WriteBack:
+    """Write a session folder's tuning into the machine's drives.
+
+    Raises
+    ------
+    DrivesError, FieldtoolError
+        As :func:`run`.
+    """
+    folder = SessionFolder(folder_path)
+    tuning = read_tuning(folder.tuning)
+    with open_session(folder.machine, folder_path, screen, never, keep_profile=True) as (s, group):
+        result = _write(s, group, tuning, options, confirm)
+        if result is None:
+            raise FileFormatError(folder.tuning, "writing was not asked for")
+        return result
+
+
+def restore(machine: str | Path, backup: Path, store: bool = False) -> tuple[HeldObject, ...]:
+    """Bring a backup back into a machine's drives; return what had to be written.
+
+    Raises
+    ------
+    ProfileError, WrongDeviceError, WriteBackMixedError
+        If the backup is none, was made on other drives, or does not come back whole.
+    """
+    path = backup / "parameters-before.yaml" if backup.is_dir() else backup
+    load_backup(path)
+    with connect(load_machine(machine)) as group:
+        return undo(group.drives, path, store)
+
+
+def _identify(session: Session, options: Options) -> Identified:
+    session.screen.stage("Identify masses, springs, couplings and dampers")
+    machine = session.machine
+    identified = identify_recording(
+        load(session.folder.recording),
+        {},
+        prior_model(machine),
+        data_sheet_masses(machine, options),
+    )
+    for note in identified.notes:
+        session.warn(note)
+    _keep(session.folder, identified, prior_model(machine))
+    return identified
+
+
+def _keep(folder: SessionFolder, identified: Identified, prior: MachineModel | None) -> None:
+    save_responses(identified.responses, folder.frequency_response)
+    write_model(identified.model, folder.model)
+    draw_responses(identified.responses, identified.model, prior, folder.picture)
+    folder.note("identified", notes=list(identified.notes))
+
+
+def _design(folder: SessionFolder, model: MachineModel) -> Tuning:
+    tuning = design(model)
+    write_yaml(folder.tuning, tuning_as_dict(tuning))
+    return tuning
+
+
+def _write(
+    session: Session,
+    group: CanopenGroup,
+    tuning: Tuning,
+    options: Options,
+    confirm: Confirm,
+) -> WriteBack | None:
+    folder = session.folder
+    if not options.write:
+        changes = changes_for(group.drives, tuning)
+        return WriteBack((), changes, in_memory=False, stored=False, backup=None)
+    session.screen.stage("Write the new parameters, and read them back")
+    backup = folder.parameters_before
+    result = apply(session.machine.name, group.drives, tuning, backup, confirm, options.store)
+    write_yaml(
+        folder.journal,
+        {
+            "format": "fieldtool-write-journal/1",
+            "machine": session.machine.name,
+            "backup": backup.name,
+            "in_memory": result.in_memory,
+            "stored": result.stored,
+            "parameters": parameter_table(result),
+        },
+    )
+    session.screen.say(result.sentence)
+    return result
