@@ -7,6 +7,8 @@ from drives.errors import DrivesError, NotSupportedError, SdoAbortError, SdoTime
 from drives.objects import ObjectAddress, ObjectInfo, type_bits
 
 PDO_OFF = 1 << 31
+NO_MODE = 0
+"""Of 0x6060; some drives show it and refuse it."""
 COAST = 0
 QUICK_STOP_RAMP = {"disable": 2, "hold": 6}
 """Values of 0x605A: slow down on the quick stop ramp, then switch on disabled, or stay."""
@@ -31,7 +33,7 @@ class TemporaryObjects:
 
     def __init__(self, drive: CanopenDrive) -> None:
         self._drive = drive
-        self._before: list[tuple[ObjectInfo, int]] = []
+        self._before: list[tuple[ObjectInfo, int, bool]] = []
 
     def change(self, info: ObjectInfo, value: int, before: int | None = None) -> None:
         """Write a value, remembering the one before (read now, unless given)."""
@@ -39,7 +41,7 @@ class TemporaryObjects:
             before = self._drive.read_int(info)
         if before == value:
             return
-        self._before.append((info, before))
+        self.note(info, before)
         self._drive.write(info, value)
         found = self._drive.read_int(info)
         if found != value:
@@ -48,9 +50,12 @@ class TemporaryObjects:
                 f"holds {found}. It can not be used safely."
             )
 
-    def note(self, info: ObjectInfo, before: int) -> None:
-        """Remember a value to be written when all is put back."""
-        self._before.append((info, before))
+    def note(self, info: ObjectInfo, before: int, matters: bool = True) -> None:
+        """Remember a value to be written when all is put back.
+
+        What does not matter, such as a mapping entry that is not in use, may be refused then.
+        """
+        self._before.append((info, before, matters))
 
     def put_back(self) -> list[str]:
         """Write all old values, newest first; return what failed, in words.
@@ -59,20 +64,21 @@ class TemporaryObjects:
         """
         failures = []
         while self._before:
-            info, before = self._before.pop()
+            info, before, matters = self._before.pop()
             try:
                 self._drive.write(info, before)
             except SdoTimeoutError as error:
                 failures.append(str(error))
                 if self._before and not self._drive.answers():
-                    left = dict.fromkeys(str(info.address) for info, _ in self._before)
+                    left = dict.fromkeys(str(info.address) for info, *_ in self._before)
                     failures.append(
                         f"{self._drive.axis}: node {self._drive.node_id} does not answer any more; "
                         f"not put back: {', '.join(left)}. Switch the drive off and on."
                     )
                     self._before.clear()
             except DrivesError as error:
-                failures.append(str(error))
+                if matters:
+                    failures.append(str(error))
         return failures
 
 
@@ -84,7 +90,8 @@ def mode(drive: CanopenDrive, wanted: Mode, changes: TemporaryObjects) -> None:
     NotSupportedError
         If the drive does not confirm.
     """
-    changes.note(objects.MODE, drive.read_int(objects.MODE))
+    before = drive.read_int(objects.MODE)
+    changes.note(objects.MODE, before, matters=before != NO_MODE)
     drive.set_mode(wanted)
 
 
@@ -192,6 +199,10 @@ def _map(
     off = (old_identifier | PDO_OFF) & 0xFFFFFFFF
     changes.note(identifier, old_identifier)
     changes.note(count, old_count)
+    for k in range(old_count, len(entries)):
+        unused = drive.read_optional(_entry(mapping, k + 1))
+        if unused is not None:
+            changes.note(_entry(mapping, k + 1), unused, matters=False)
     for k, old in enumerate(old_entries):
         changes.note(_entry(mapping, k + 1), old)
     changes.note(count, 0)

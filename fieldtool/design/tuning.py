@@ -1,9 +1,9 @@
 """From the model to controller parameters, by a documented rule.
 
 For each axis, with J the sum of its chain's masses and w_a the lowest antiresonance (its chain's
-lowest mode with the motor held; a rigid axis takes ``RIGID_BANDWIDTH``)::
+lowest mode with the motor held; infinite for a rigid axis)::
 
-    w_v = 0.7 w_a            bandwidth that is aimed at
+    w_v = 0.7 w_a            bandwidth that is aimed at, at most RIGID_BANDWIDTH
     velocity_p = J w_v       velocity_i = velocity_p w_v / 4        position_p = w_v / 4
     velocity_ff = 1          inertia_ff = J
     filter 1: notch at the dominating resonance, where the margin below allows it
@@ -26,7 +26,7 @@ from fieldtool.records.model import AxisModel, FloatArray, MachineModel
 
 BANDWIDTH_SHARE = 0.7
 RIGID_BANDWIDTH = 2 * np.pi * 8.0
-"""rad/s, for an axis without a spring."""
+"""rad/s, for an axis without a spring or with a stiff one: the bandwidth that is aimed at, at most."""
 RATIO = 4.0
 SENSITIVITY_BOUND = 2.0
 LOWERED = 0.85
@@ -64,8 +64,9 @@ def design(model: MachineModel) -> Tuning:
     Raises
     ------
     DesignError
-        If the loops are not stable, or the margin can not be kept.
+        If the model is no machine, the loops are not stable, or the margin can not be kept.
     """
+    _check_masses(model)
     loops = [_rule(axis) for axis in model.axes]
     loops = _within_bound(model, loops)
     for k in range(len(loops)):
@@ -131,6 +132,16 @@ def as_parameters(loop: AxisLoop) -> dict[str, float]:
             "filter1_pole_damping": d1 / (2 * float(np.sqrt(d0))),
         }
     return parameters
+
+
+def _check_masses(model: MachineModel) -> None:
+    smallest = float(np.linalg.eigvalsh(model.mass_matrix)[0])
+    if smallest <= 0:
+        raise DesignError(
+            f"the model's mass matrix is not positive definite (smallest eigenvalue {smallest:.3g}); "
+            "nothing is written. Check the model: a mass is not positive, or a coupling is larger than "
+            "the last masses that it joins allow."
+        )
 
 
 def _rule(axis: AxisModel) -> AxisLoop:
