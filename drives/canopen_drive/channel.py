@@ -11,17 +11,21 @@ from math import floor
 import can
 
 from drives.canopen_drive.drive import CanopenDrive
+from drives.canopen_drive.line import NMT_OPERATIONAL
 from drives.canopen_drive.setup import DRIVE_HEARTBEAT
 from drives.cia402 import ENABLED_MASK, ENABLED_VALUE, PowerState, emergency_text
 
 OUTPUT = struct.Struct("<Hih")
 INPUT = struct.Struct("<Hih")
-NMT_OPERATIONAL = 5
 
 MISSING_ALLOWED = 1
 """Cycles in a row in which a PDO may be missing."""
 HEARTBEATS_MISSED = 3.5
 """Heartbeat times after which a silent drive counts as lost."""
+STUCK_SHARE, STUCK_UNITS, STUCK_TIME = 8, 20, 0.02
+"""A target that moves by a part of the following error window, and by so many units at least,
+while the position does not change at all for so many seconds: the encoder is stuck, or the axis is
+blocked."""
 _MOST_UNITS = 2**33
 """More position units than any change or error of a 32-bit position can have."""
 
@@ -54,6 +58,11 @@ class Channel:
     rebooted: bool = False
     hold: int | None = None
     """Where it was first seen enabled, position units: its target until others are streamed."""
+    anchor: int | None = None
+    """Target when the position changed last."""
+    still: int = 0
+    """Samples in a row with the same position."""
+    still_allowed: int = 20
 
     @property
     def state(self) -> PowerState | None:
@@ -76,8 +85,19 @@ class Channel:
         self.statusword, self.position, _ = INPUT.unpack(data)
         if first:
             self.previous = self.position
+        self.still += 1
+        if self.position != self.previous:
+            self.anchor, self.still = None, 0
         self.allowed = self.step * (1 + self.missing)
         self.missing = 0
+
+    def is_stuck(self, target: int) -> bool:
+        """Whether the position stands while the target moves."""
+        if self.anchor is None:
+            self.anchor = target
+        if self.free or self.still < self.still_allowed:
+            return False
+        return abs(target - self.anchor) > max(self.window // STUCK_SHARE, STUCK_UNITS)
 
     def is_fine(self, target: int, now: float) -> bool:
         """Whether the drive is enabled, heard, and inside all limits; target in position units."""
@@ -88,6 +108,7 @@ class Channel:
             and -self.torque <= torque <= self.torque
             and -self.allowed <= position - self.previous <= self.allowed
             and (self.free or -self.window <= target - position <= self.window)
+            and not self.is_stuck(target)
             and not self.emergencies
             and self.missing <= MISSING_ALLOWED
             and self.nmt_state == NMT_OPERATIONAL
@@ -132,6 +153,12 @@ class Channel:
                 f"{limits.following_error:g} {unit}; all axes were stopped. Does the axis move the "
                 "wrong way, or is it blocked?"
             )
+        if self.is_stuck(target):
+            return (
+                f"{drive.axis}: does not move at all while its target moves; its power was cut and "
+                "all axes were stopped. Does the encoder count, is the axis blocked or its brake "
+                "closed? If only friction holds it, allow it a larger following error."
+            )
         if abs(position - self.previous) > self.allowed:
             cycles = max(1, self.allowed // self.step)
             speed = (position - self.previous) * scale.position / (cycle_time * cycles)
@@ -172,5 +199,6 @@ def channel_of(drive: CanopenDrive, cycle_time: float, free: bool) -> Channel:
         high=scale.position_units(limits.travel[1]),
         step=max(2, 1 + floor(min(limits.velocity * cycle_time / scale.velocity, _MOST_UNITS))),
         torque=floor(min(limits.torque / scale.torque * (1 + 1e-12), _MOST_UNITS)),
+        still_allowed=max(3, round(STUCK_TIME / cycle_time)),
         window=floor(min(limits.following_error / scale.position * (1 + 1e-12), _MOST_UNITS)),
     )

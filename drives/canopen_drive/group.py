@@ -104,7 +104,8 @@ class CanopenGroup:
                 setup.cycle(drive, cycle_time, changes)
                 setup.mode(drive, mode, changes)
                 setup.process_data(drive, changes)
-            for drive in self._drives:  # last, and so first to be put back: no heartbeat after that
+            stack.callback(self.line.end_heartbeat)
+            for drive in self._drives:  # last, and so first to be put back
                 setup.fail_safe(drive, self._changes(stack, drive))
             for drive in self._drives:
                 stack.callback(self._leave_operational, drive)
@@ -113,6 +114,7 @@ class CanopenGroup:
             motion = CanopenMotion(
                 self.line, self._drives, cycle_time, frozenset(free), self._stop_requested
             )
+            self.line.begin_heartbeat(setup.HOST_NODE_ID, setup.HOST_HEARTBEAT)
             stack.callback(self._note_late_cycles, motion)
             stack.callback(motion.end)
             try:

@@ -6,6 +6,7 @@ it matters, and time is the bus' own.
 """
 
 from collections.abc import Callable
+from math import inf
 
 import can
 import canopen
@@ -14,6 +15,9 @@ from canopen.sdo import SdoClient, SdoCommunicationError
 from drives.bus import Clock, clock_of
 from drives.errors import BusError
 
+NMT_OPERATIONAL = 5
+SHORTEST_WAIT = 1e-4
+"""Seconds; a difference of two times may be smaller than a clock can tell."""
 SDO_TIMEOUT = 0.5
 """Seconds a drive may take for an ordinary SDO answer."""
 
@@ -25,6 +29,33 @@ class Line(canopen.Network):  # type: ignore[misc]
         super().__init__(bus)
         self.can_bus = bus
         self.clock: Clock = clock_of(bus)
+        self._beat: can.Message | None = None
+        self._next_beat = self._beat_period = 0.0
+
+    def begin_heartbeat(self, node_id: int, period: float) -> None:
+        """Be a node that is operational, seen by its heartbeat every so many seconds, from now on.
+
+        It is sent by :meth:`beat`, and while somebody waits for an answer; there is no thread that
+        would go on when the program hangs.
+        """
+        self._beat = can.Message(
+            arbitration_id=0x700 + node_id, data=bytes([NMT_OPERATIONAL]), is_extended_id=False
+        )
+        self._beat_period, self._next_beat = period, self.clock.now()
+
+    def end_heartbeat(self) -> None:
+        """Send no heartbeat any more."""
+        self._beat = None
+
+    def beat(self) -> float:
+        """Send the heartbeat if it is due; return the seconds until the next one."""
+        if self._beat is None:
+            return inf
+        now = self.clock.now()
+        if now >= self._next_beat:
+            self.send(self._beat)
+            self._next_beat = now + self._beat_period
+        return self._next_beat - now
 
     def send(self, message: can.Message) -> None:
         """Send a frame; raise BusError if the bus does not take it."""
@@ -58,7 +89,7 @@ class Line(canopen.Network):  # type: ignore[misc]
             left = deadline - self.clock.now()
             if left <= 0:
                 return until()
-            self.pump(left)
+            self.pump(max(SHORTEST_WAIT, min(left, self.beat())))
         return True
 
 

@@ -11,11 +11,10 @@ import can
 import numpy as np
 
 from drives.api import Capture, FloatArray, Source, joined
-from drives.canopen_drive.channel import INPUT, NMT_OPERATIONAL, OUTPUT, Channel, channel_of
+from drives.canopen_drive.channel import INPUT, OUTPUT, Channel, channel_of
 from drives.canopen_drive.drive import CanopenDrive
 from drives.canopen_drive.interrupts import uninterrupted
 from drives.canopen_drive.line import Line
-from drives.canopen_drive.setup import HOST_HEARTBEAT, HOST_NODE_ID
 from drives.cia402 import ENABLED_VALUE, STEP_TOWARDS_ENABLED, Controlword, PowerState
 from drives.errors import (
     BusError,
@@ -56,10 +55,6 @@ class CanopenMotion:
         self._by_cob = {0x180 + c.drive.node_id: k for k, c in enumerate(self._channels)}
         self._by_node = {c.drive.node_id: c for c in self._channels}
         self._sync = can.Message(arbitration_id=0x80, is_extended_id=False)
-        self._heartbeat = can.Message(
-            arbitration_id=0x700 + HOST_NODE_ID, data=bytes([NMT_OPERATIONAL]), is_extended_id=False
-        )
-        self._next_heartbeat = 0.0
         self._start = 0.0
         self._count = 0
         self._stopped = False
@@ -114,7 +109,7 @@ class CanopenMotion:
             If an axis leaves a limit as soon as it is enabled; all are disabled.
         """
         now = self._line.clock.now()
-        self._start, self._count, self._next_heartbeat = now + self._cycle_time, 0, now
+        self._start, self._count = now + self._cycle_time, 0
         for channel in self._channels:
             node_id = channel.drive.node_id
             channel.heard = now
@@ -341,9 +336,7 @@ class CanopenMotion:
             channel.output.data = bytearray(output)
             line.send(channel.output)
         moment = self._start + self._count * self._cycle_time
-        if clock.now() >= self._next_heartbeat:
-            line.send(self._heartbeat)
-            self._next_heartbeat = clock.now() + HOST_HEARTBEAT
+        line.beat()
         clock.wait_until(moment - 1e-7)
         late = clock.now() - moment
         if late > self._cycle_time / 2:
@@ -423,6 +416,7 @@ class CanopenMotion:
                     channel.violation(target, self._cycle_time),
                     axis=channel.drive.axis,
                     cycle=self._count - 1,
+                    runaway=channel.is_stuck(target),
                 )
 
 

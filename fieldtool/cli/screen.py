@@ -65,7 +65,7 @@ class TerminalScreen:
     def stage(self, title: str) -> None:
         """Show the title of a new stage."""
         self._close()
-        self.console.print(f"[bold]▶ {title}[/bold]")
+        self.console.print(Text(f"▶ {title}", style="bold"))
 
     def say(self, sentence: str) -> None:
         """Show a sentence."""
@@ -79,7 +79,8 @@ class TerminalScreen:
             sweeps.add_column(title, style="cyan" if title == "axis moved" else "")
         for sweep in plan.sweeps:
             tones = [tone.frequency for tone in sweep.tones]
-            sweeps.add_row(
+            _add(
+                sweeps,
                 sweep.driven,
                 sweep.kind,
                 ", ".join(sweep.free) or "none, all held",
@@ -91,7 +92,8 @@ class TerminalScreen:
         for title in ("axis", "moves at most", "speed", "torque", "following error"):
             peaks.add_column(title)
         for axis in expected:
-            peaks.add_row(
+            _add(
+                peaks,
                 axis.axis,
                 f"±{axis.excursion:.3g} {UNITS[axis.kind]['position']}",
                 f"{axis.velocity:.3g} {UNITS[axis.kind]['position']}/s",
@@ -108,7 +110,7 @@ class TerminalScreen:
         """Move the bar."""
         if self._bar is None:
             self._bar = Bar(
-                TextColumn("  {task.description}"),
+                TextColumn("  {task.description}", markup=False),
                 BarColumn(bar_width=24),
                 TextColumn("{task.percentage:>3.0f} %"),
                 _Left(),
@@ -131,13 +133,23 @@ class TerminalScreen:
             self._last_shown = perf_counter()
             task = self._bar.tasks[0]
             self.console.print(
-                f"  {100 * progress.done:.0f} %, {task.description}, {_Left().render(task)}"
+                Text(f"  {100 * progress.done:.0f} %, {task.description}, {_Left().render(task)}")
             )
 
     def _close(self) -> None:
         if self._bar is not None:
             self._bar.stop()
             self._bar = None
+
+
+def _add(table: Table, *cells: str, style: str = "") -> None:
+    """Add a row of plain text: brackets in names are no markup."""
+    table.add_row(*(Text(cell) for cell in cells), style=style)
+
+
+def _column(table: Table, title: str, *, words: bool) -> None:
+    """Add a column that loses nothing on a narrow terminal: what does not fit is folded."""
+    table.add_column(title, justify="left" if words else "right", overflow="fold")
 
 
 def _clock(seconds: float) -> str:
@@ -176,10 +188,10 @@ def model_table(
     ]
     table = Table(box=None, padding=(0, 2))
     for title in ("axis", "what", "value", "± (95 %)", "unit"):
-        table.add_column(title, justify="left" if title in ("axis", "what", "unit") else "right")
+        _column(table, title, words=title in ("axis", "what", "unit"))
     if truth is not None:
-        table.add_column("simulated truth", justify="right")
-        table.add_column("error", justify="right")
+        _column(table, "simulated truth", words=False)
+        _column(table, "error", words=False)
     for k, axis in enumerate(model.axes):
         true_axis = truth.axes[k] if truth else None
         for what, plural in (
@@ -243,12 +255,12 @@ def _row(
     if truth is not None and true is not None:
         error = f"{100 * (value.value / true.value - 1):+.2f} %" if true.value else ""
         cells += [f"{true.value:g}", error]
-    table.add_row(*cells)
+    _add(table, *cells)
 
 
 def parameter_rows(rows: Sequence[Mapping[str, Any]], drive_units: Mapping[Any, Any]) -> Table:
     """Return old and new parameters in physical and in drive units, and what was read back."""
-    table = Table(box=None, padding=(0, 2))
+    table = Table(box=None, padding=(0, 1))
     for title in (
         "axis",
         "parameter",
@@ -259,13 +271,12 @@ def parameter_rows(rows: Sequence[Mapping[str, Any]], drive_units: Mapping[Any, 
         "new (drive)",
         "read back",
     ):
-        table.add_column(
-            title, justify="left" if title in ("axis", "parameter", "unit") else "right"
-        )
+        _column(table, title, words=title in ("axis", "parameter", "unit"))
     for row in rows:
         raw = drive_units.get((row["axis"], row["name"]), ("", ""))
         same = row["before"] == row["after"]
-        table.add_row(
+        _add(
+            table,
             row["axis"],
             row["name"],
             f"{row['before']:.6g}",
@@ -294,9 +305,11 @@ def show_result(console: Console, result: SessionResult) -> None:
         raw = {(c.axis, c.name): (c.before_raw, c.after_raw) for c in result.write_back.changes}
         console.print(parameter_rows(parameter_table(result.write_back), raw))
         for axis in result.tuning.axes:
-            console.print(f"  {axis.axis}: {axis.reason}")
-        console.print(f"  {result.write_back.sentence}")
+            console.print(Text(f"  {axis.axis}: {axis.reason}"))
+        console.print(Text(f"  {result.write_back.sentence}"))
     console.print(
-        f"\nMachine time {_clock(result.machine_time)}, wall time {_clock(result.wall_time)}. "
-        f"Everything is in {result.folder}"
+        Text(
+            f"\nMachine time {_clock(result.machine_time)}, wall time {_clock(result.wall_time)}. "
+            f"Everything is in {result.folder}"
+        )
     )

@@ -197,6 +197,8 @@ def _dominating_resonance(model: MachineModel, k: int) -> float | None:
     if not elastic.any():
         return None
     share = np.where(elastic, shapes[motor] ** 2, 0.0)
+    if share.max() < 1e-12 * np.sum(shapes[motor] ** 2):
+        return None  # a rigid axis, not coupled: the machine's resonances are not its own
     return float(np.sqrt(values[int(np.argmax(share))]))
 
 

@@ -188,10 +188,11 @@ def _tones(
     frequencies: FloatArray,
     cycle_time: float,
 ) -> tuple[Tone, ...]:
-    amplitudes = _amplitudes(setting, axis, free, frequencies)
+    tones = [tone_near(float(f), 0.0, cycle_time) for f in frequencies]
+    # at the frequencies that they really have: beside a lightly damped mode 0.1 % matters
+    amplitudes = _amplitudes(setting, axis, free, np.array([tone.frequency for tone in tones]))
     return tuple(
-        tone_near(float(f), float(a), cycle_time)
-        for f, a in zip(frequencies, amplitudes, strict=True)
+        replace(tone, amplitude=float(a)) for tone, a in zip(tones, amplitudes, strict=True)
     )
 
 

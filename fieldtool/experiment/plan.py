@@ -148,15 +148,13 @@ def transition(tone: Tone | None, before: Tone | None) -> FloatArray:
     if known is None:
         raise ValueError("a transition needs a tone on one side at least")
     a, b = before or known, tone or known
-    duration = max(1 / a.frequency, 1 / b.frequency, 0.25)
-    n = max(2, round(1.5 * duration / known.cycle_time))
+    mean = (a.frequency + b.frequency) / 2
+    whole = max(1, round(1.5 * mean * max(1 / a.frequency, 1 / b.frequency, 0.25)))
+    n = max(2, round(whole / mean / known.cycle_time))
     blend = 0.5 - 0.5 * np.cos(np.pi * np.arange(n) / n)
     frequency = a.frequency + (b.frequency - a.frequency) * blend
     turns = np.concatenate([[0.0], np.cumsum(frequency) * known.cycle_time])
-    whole = max(1, round(turns[-1]))
-    phase = (
-        2 * np.pi * (turns[:-1] + (whole - turns[-1]) * blend)
-    )  # whole turns, no kink at the ends
+    phase = 2 * np.pi * (turns[:-1] + (whole - turns[-1]) * blend)  # what rounding to cycles left
     low = before.amplitude if before else 0.0
     high = tone.amplitude if tone else 0.0
     displacement: FloatArray = (low + (high - low) * blend) * np.sin(phase)

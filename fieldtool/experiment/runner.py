@@ -38,11 +38,15 @@ CHECK_SHARE = 0.05
 """Share of the velocity and acceleration limits that these moves use."""
 CHECK_MOVE = 0.02
 """Share of the travel by which each axis moves when its direction is checked."""
+CHECK_NUDGE = 0.1
+"""Share of that move by which each axis is nudged first."""
 CHECK_SLICE = 2
 """Cycles after which the check looks at what the axes did."""
 CHECK_ASTRAY, CHECK_PUSHED = 1e-3, 10.0
 """Share of its travel that an axis may go the wrong way or drift in the check; an axis that does
 not move itself may be pushed by the factor more."""
+CHECK_QUIET = 0.5
+"""Share of what it may drift within which an axis counts as standing, before the check begins."""
 CHECK_STARTED = 0.02
 """Share of the check's move that an axis must have done when half of it was commanded."""
 LONGEST_MOVE = 600.0
@@ -109,8 +113,9 @@ class Axes:
 def check_directions(group: Mover, axes: Axes, cycle_time: float, keep: Keep) -> None:
     """Move every axis a little and back, where it stands, and see that it goes the right way.
 
-    Each axis moves towards its centre.  It is judged every few cycles, long before its following
-    error leaves the limit: a loop of the wrong sign runs away as soon as it is enabled.
+    Each axis moves towards its centre, at first by a nudge only.  It is judged every few cycles, long
+    before its following error leaves the limit: a loop of the wrong sign runs away from the smallest
+    push, its own or another axis', and the nudges find that while it is slow.
 
     Raises
     ------
@@ -124,8 +129,13 @@ def check_directions(group: Mover, axes: Axes, cycle_time: float, keep: Keep) ->
     experiments: list[Experiment] = []
     try:
         with group.motion(cycle_time) as motion:
+            start = motion.position
             for k in range(len(axes.names)):
-                check = _DirectionCheck(axes, k, motion.position, cycle_time)
+                nudge = _DirectionCheck(axes, k, start, cycle_time, nudge=True)
+                _stream_check(motion, nudge, axes.names[k], experiments.append)
+            experiments.clear()  # of the nudges only one that was cut short is worth keeping
+            for k in range(len(axes.names)):
+                check = _DirectionCheck(axes, k, start, cycle_time)
                 capture = _stream_check(motion, check, axes.names[k], experiments.append)
                 check.judge(capture)
     except BaseException as error:
@@ -154,10 +164,15 @@ def _check_pace(axes: Axes) -> None:
 
 
 class _DirectionCheck:
-    """One axis' small move, in slices of a few cycles that are judged as they come."""
+    """One axis' small move, in slices of a few cycles that are judged as they come.
 
-    def __init__(self, axes: Axes, k: int, start: FloatArray, cycle_time: float) -> None:
-        self._axes, self._k, self._start = axes, k, start
+    It begins when nothing swings any more from the check of the axis before.
+    """
+
+    def __init__(
+        self, axes: Axes, k: int, start: FloatArray, cycle_time: float, nudge: bool = False
+    ) -> None:
+        self._axes, self._k, self._start, self._nudge = axes, k, start, nudge
         limits = axes.limits[k]
         size = CHECK_MOVE * (limits.travel[1] - limits.travel[0])
         self._wanted = float(np.copysign(size, axes.centre[k] - start[k]))
@@ -171,12 +186,23 @@ class _DirectionCheck:
         self._rows = there.size
         rest, away = np.zeros(self._rest), np.full(self._rest, self._wanted)
         self._path = np.concatenate([rest, there, away, self._wanted - there, rest])
+        if nudge:
+            self._path, self._wanted = CHECK_NUDGE * self._path, CHECK_NUDGE * self._wanted
         self._done = 0
+        travel = np.array([one.travel[1] - one.travel[0] for one in axes.limits])
+        self._allowed = CHECK_ASTRAY * travel
+        self._waiting = k > 0 or not nudge
+        self._waited = self._still = 0
+        self._still_rows = round(STILL_TIME / cycle_time)
+        self._longest_wait = round(STILL_TIMEOUT / cycle_time)
 
     def __call__(self, before: Capture | None) -> FloatArray | None:
         """Return the next slice of targets; see ``drives.api.Source``."""
         if before is not None:
             self._watch(before)
+        if self._waiting:
+            self._waited += CHECK_SLICE
+            return np.tile(self._start, (CHECK_SLICE, 1))
         if self._done >= self._path.size:
             return None
         part = self._path[self._done : self._done + CHECK_SLICE]
@@ -186,16 +212,18 @@ class _DirectionCheck:
         return targets
 
     def _watch(self, capture: Capture) -> None:
+        moved = capture.position[-1] - self._start
+        pushed = not self._nudge and (self._waiting or self._done > self._rest)
         for j, name in enumerate(self._axes.names):
-            limits = self._axes.limits[j]
-            allowed = CHECK_ASTRAY * (limits.travel[1] - limits.travel[0])
-            moved = float(capture.position[-1, j] - self._start[j])
-            if j != self._k:
-                self._stay(name, moved, CHECK_PUSHED * allowed)
-            elif self._done <= self._rest:
-                self._stay(name, moved, allowed)
+            allowed = float(self._allowed[j])
+            if self._done > self._rest and j == self._k:
+                self._follow(name, float(moved[j]), allowed)
             else:
-                self._follow(name, moved, allowed)
+                self._stay(name, float(moved[j]), allowed * (CHECK_PUSHED if pushed else 1.0))
+        quiet = bool(np.all(np.abs(moved) < CHECK_QUIET * self._allowed))
+        self._still = self._still + CHECK_SLICE if quiet else 0
+        if self._still >= self._still_rows or self._waited >= self._longest_wait:
+            self._waiting = False
 
     @staticmethod
     def _stay(name: str, moved: float, allowed: float) -> None:
@@ -212,7 +240,9 @@ class _DirectionCheck:
     def _follow(self, name: str, moved: float, allowed: float) -> None:
         forward = moved * np.sign(self._wanted)
         size = abs(self._wanted)
-        if forward < -allowed or forward > 1.5 * size:
+        comes_back = self._done > 2 * self._rest + self._rows
+        astray = 0.5 * size if comes_back else allowed  # it may overshoot, there as well as back
+        if forward < -astray or forward > 1.5 * size:
             raise SafetyStopError(
                 f"{name}: moves the wrong way or by itself: {self._wanted:.3g} was commanded, it moved "
                 f"{moved:.3g}; its power was cut and all axes were stopped. Check the encoder's "
@@ -221,7 +251,7 @@ class _DirectionCheck:
                 runaway=True,
             )
         half_way = self._rest + self._rows // 2 <= self._done < self._rest + self._rows
-        if half_way and forward < CHECK_STARTED * size:
+        if half_way and not self._nudge and forward < CHECK_STARTED * size:
             raise SafetyStopError(
                 f"{name}: does not follow: half of {self._wanted:.3g} was commanded, it moved "
                 f"{moved:.3g}; its power was cut and all axes were stopped. Is it blocked or its brake "
@@ -233,7 +263,7 @@ class _DirectionCheck:
     def judge(self, capture: Capture) -> None:
         """Raise SafetyStopError if the whole move was not what was commanded."""
         name, wanted, k = self._axes.names[self._k], self._wanted, self._k
-        position, torque = capture.position[:, k], capture.torque[:, k]
+        position, torque = capture.position[self._waited :, k], capture.torque[self._waited :, k]
         moved = float(position[2 * self._rest + self._rows - 1] - position[0])
         if not 0.5 < moved / wanted < 1.5:
             raise SafetyStopError(

@@ -100,12 +100,9 @@ def dynamic_stiffness_low(
             "positive: torque and position disagree in sign, or noise hides the mass. Check the "
             "sign of the torque, or use a larger amplitude."
         )
-    cut_off = 0.0
-    if frequencies.size > chosen + 2:
-        cut_off = float(_polynomial(omega2, mass, mass_std, chosen + 1)[0][0] - coefficients[0])
     return LowFrequencyMass(
         mass=float(coefficients[0]),
-        std=float(np.hypot(errors[0] * max(scatter, 1.0), cut_off)),
+        std=_std_at_zero(omega2, mass, mass_std, chosen),
         degree=chosen,
         scatter=scatter,
         frequencies=frequencies,
@@ -124,6 +121,15 @@ def _lowest_degree(omega2: FloatArray, mass: FloatArray, std: FloatArray) -> int
         if all(abs(c[-1]) <= 2.5 * e[-1] * max(s, 1.0) for c, e, s in fits):
             return degree
     return max(top, 0)
+
+
+def _std_at_zero(omega2: FloatArray, values: FloatArray, std: FloatArray, degree: int) -> float:
+    """Error at zero: the fit's, raised by scatter, and what one more term would change."""
+    coefficients, errors, scatter = _polynomial(omega2, values, std, degree)
+    cut_off = 0.0
+    if omega2.size > degree + 2:
+        cut_off = float(_polynomial(omega2, values, std, degree + 1)[0][0] - coefficients[0])
+    return float(np.hypot(errors[0] * max(scatter, 1.0), cut_off))
 
 
 def _polynomial(
@@ -181,7 +187,11 @@ def low_frequency_gain(
     ------
     NotEnoughDataError
         If there are fewer than three frequencies.
+    ValueError
+        If an error is not positive.
     """
+    if not np.all(std > 0):
+        raise ValueError(f"{what}: std must be above 0 at every frequency")
     if frequencies.size < 3:
         raise NotEnoughDataError(
             f"{what}: {frequencies.size} settled frequencies are too few to extrapolate to zero; at "
@@ -189,10 +199,10 @@ def low_frequency_gain(
         )
     omega2 = (2 * np.pi * frequencies) ** 2
     degree = _lowest_degree(omega2, values, std)
-    coefficients, errors, scatter = _polynomial(omega2, values, std, degree)
+    coefficients, _, scatter = _polynomial(omega2, values, std, degree)
     return LowFrequencyGain(
         float(coefficients[0]),
-        float(errors[0]) * max(scatter, 1.0),
+        _std_at_zero(omega2, values, std, degree),
         degree,
         scatter,
         frequencies,

@@ -38,6 +38,7 @@ LIMITS = {
 PROCESS_VALUES = {
     (0x1001, 0),
     *((0x1003, k) for k in range(9)),
+    (0x603F, 0),
     (0x6040, 0),
     (0x6041, 0),
     (0x6064, 0),
@@ -166,6 +167,7 @@ class Bench:
         code = ended.value.code
         outcome = Outcome(code if isinstance(code, int) else 0, captured.out, captured.err)
         assert "Traceback" not in outcome.err + outcome.out, outcome.err
+        assert "defect of fieldtool" not in outcome.err, outcome.err
         return outcome
 
     def measure(self) -> Outcome:

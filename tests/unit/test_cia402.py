@@ -34,7 +34,9 @@ def by_pattern(word: int) -> set[str]:
     return {
         name
         for name, pattern in PATTERNS.items()
-        if all(p == "x" or word >> b & 1 == int(p) for p, b in zip(pattern, PATTERN_BITS))
+        if all(
+            p == "x" or word >> b & 1 == int(p) for p, b in zip(pattern, PATTERN_BITS, strict=True)
+        )
     }
 
 

@@ -106,7 +106,7 @@ def test_no_tone_uses_more_than_its_share_of_any_limit(setting: Setting) -> None
         for sweep in plan.sweeps
         for tone in sweep.tones
     ]
-    assert max(uses) <= SHARE_OF_LIMITS * 1.02  # a peak may stand between two of the points looked at
+    assert max(uses) <= SHARE_OF_LIMITS * (1 + 1e-6)
     # and amplitudes are not small for nothing: away from modes the share is used
     assert np.quantile(uses, 0.8) > 0.5 * SHARE_OF_LIMITS
 
@@ -126,9 +126,7 @@ def test_tones_are_whole_and_in_the_band(setting: Setting) -> None:
 def test_the_sweeps_that_the_paper_asks_for(setting: Setting) -> None:
     names, (plan, _) = setting.model.names, both_plans(setting)
     found = [(s.kind, s.driven, s.free) for s in plan.sweeps]
-    expected = [
-        ("direct, others free", a, tuple(b for b in names if b != a)) for a in names
-    ]
+    expected = [("direct, others free", a, tuple(b for b in names if b != a)) for a in names]
     if len(names) > 1:
         expected += [("direct, others locked", a, ()) for a in names]
         expected += [("cross-coupled", b, (a,)) for a, b in combinations(names, 2)]
@@ -146,7 +144,9 @@ def test_the_band_covers_every_mode(setting: Setting) -> None:
 
     def hz(keep: list[int]) -> np.ndarray:
         at = np.ix_(keep, keep)
-        squares = np.linalg.eigvals(np.linalg.solve(model.mass_matrix[at], model.stiffness_matrix[at]))
+        squares = np.linalg.eigvals(
+            np.linalg.solve(model.mass_matrix[at], model.stiffness_matrix[at])
+        )
         found = np.sqrt(np.abs(squares)) / (2 * np.pi)
         return np.sort(found[found > 1e-3])
 
@@ -215,7 +215,7 @@ def test_each_limit_is_refused(
 ) -> None:
     setting = setting_for(random_model(fresh_rng, (2, 2)), fresh_rng)
     setting = replace(setting, centre=np.zeros(2))
-    plan = classic_plan(setting, setting.model.names, 0.004)
+    plan = classic_plan(setting, setting.model.names, 0.001)
     plan = replace(plan, sweeps=plan.sweeps[2:3])
     forecast(plan, setting)
     tight = replace(setting.limits[0], **change)  # type: ignore[arg-type]
@@ -229,10 +229,12 @@ def test_a_linear_axis_is_refused_in_its_units(
     random_model: RandomModel, fresh_rng: np.random.Generator
 ) -> None:
     setting = setting_for(random_model(fresh_rng, (1, 1)), fresh_rng)
-    plan = classic_plan(setting, setting.model.names, 0.004)
+    plan = classic_plan(setting, setting.model.names, 0.001)
     assert setting.model.axes[1].kind == "linear"
     tight = replace(setting.limits[1], torque=0.01)
-    with pytest.raises(PlanRefusedError, match=r"axis2 would need a torque of [\d.]+ N, .* 0.01 N\."):
+    with pytest.raises(
+        PlanRefusedError, match=r"axis2 would need a torque of [\d.]+ N, .* 0.01 N\."
+    ):
         forecast(plan, replace(setting, limits=(setting.limits[0], tight)))
 
 
@@ -240,7 +242,7 @@ def test_unstable_gains_are_refused(
     random_model: RandomModel, fresh_rng: np.random.Generator
 ) -> None:
     setting = setting_for(random_model(fresh_rng, (2, 1)), fresh_rng)
-    plan = classic_plan(setting, setting.model.names, 0.004)
+    plan = classic_plan(setting, setting.model.names, 0.001)
     wrong = replace(setting.loops[0], velocity_p=-setting.loops[0].velocity_p)
     with pytest.raises(PlanRefusedError, match=r"sweep axis1 .* not stable"):
         forecast(plan, replace(setting, loops=(wrong, setting.loops[1])))
@@ -251,9 +253,9 @@ def test_an_axis_that_may_not_float(
 ) -> None:
     setting = setting_for(random_model(fresh_rng, (2, 1)), fresh_rng)
     with pytest.raises(PlanRefusedError, match=r"axis2 may not \(`may_float`"):
-        classic_plan(setting, ["axis1"], 0.004)
+        classic_plan(setting, ["axis1"], 0.001)
     alone = setting_for(random_model(fresh_rng, (3,)), fresh_rng)
-    assert len(classic_plan(alone, [], 0.004).sweeps) == 1  # nothing else floats
+    assert len(classic_plan(alone, [], 0.001).sweeps) == 1  # nothing else floats
 
 
 def test_the_cycle_time_follows_from_modes_and_bus(
@@ -274,6 +276,6 @@ def test_the_choice_about_friction_is_shown(
     random_model: RandomModel, fresh_rng: np.random.Generator
 ) -> None:
     setting = setting_for(random_model(fresh_rng, (2, 1)), fresh_rng)
-    plan = classic_plan(setting, setting.model.names, 0.004)
+    plan = classic_plan(setting, setting.model.names, 0.001)
     lowest = min(t.frequency for s in plan.sweeps[2:] for t in s.tones)
     assert any(f"down to {lowest:.2g} Hz" in note for note in plan.notes)

@@ -59,7 +59,9 @@ def state_space(closed: ClosedLoop) -> tuple[np.ndarray, ...]:
             num = np.polymul(num, np.trim_zeros(biquad.numerator, "f"))
             den = np.polymul(den, [1.0, *biquad.denominator])
         pi.append(
-            signal.tf2ss(np.polymul([loop.velocity_p, loop.velocity_i], num), np.polymul([1, 0], den))
+            signal.tf2ss(
+                np.polymul([loop.velocity_p, loop.velocity_i], num), np.polymul([1, 0], den)
+            )
         )
         shapes.append(signal.tf2ss(num, den))
         p[k], kff[k], jff[k] = loop.position_p, loop.velocity_ff, loop.inertia_ff
@@ -243,9 +245,7 @@ def test_filters_are_notch_and_low_pass() -> None:
     f = np.array([0.01, 40.0, 1e6])
     np.testing.assert_allclose(np.abs(notch.response(TWO_PI * 1j * f)), [1, 0.2, 1], rtol=1e-6)
     f = np.array([0.01, 80.0, 8000.0])
-    np.testing.assert_allclose(
-        np.abs(low.response(TWO_PI * 1j * f)), [1, 1 / 1.4, 1e-4], rtol=1e-3
-    )
+    np.testing.assert_allclose(np.abs(low.response(TWO_PI * 1j * f)), [1, 1 / 1.4, 1e-4], rtol=1e-3)
     w = TWO_PI * np.geomspace(1, 500, 50)
     _, expected = signal.freqs(notch.numerator, [1.0, *notch.denominator], w)
     np.testing.assert_allclose(notch.response(1j * w), expected, rtol=1e-12)

@@ -75,7 +75,9 @@ def test_matrices_are_symmetric_and_springs_hold_no_rigid_motion(
     random_model: RandomModel, fresh_rng: np.random.Generator
 ) -> None:
     for _ in range(20):
-        lengths = tuple(int(n) for n in fresh_rng.integers(1, 7, size=int(fresh_rng.integers(1, 5))))
+        lengths = tuple(
+            int(n) for n in fresh_rng.integers(1, 7, size=int(fresh_rng.integers(1, 5)))
+        )
         model = random_model(fresh_rng, lengths)
         for matrix in (model.mass_matrix, model.stiffness_matrix, model.damping_matrix):
             np.testing.assert_array_equal(matrix, matrix.T)
@@ -116,9 +118,7 @@ def machines(draw: st.DrawFn) -> MachineModel:
         masses = draw(st.lists(estimates, min_size=n, max_size=n))
         dampers = tuple(draw(few)) if draw(st.booleans()) else ()
         kind = draw(st.sampled_from(["rotary", "linear"]))
-        axes.append(
-            AxisModel(f"x{k}", kind, tuple(masses), tuple(draw(few)), dampers, *frictions)
-        )
+        axes.append(AxisModel(f"x{k}", kind, tuple(masses), tuple(draw(few)), dampers, *frictions))
     pairs = [(f"x{i}", f"x{j}") for i in range(len(axes)) for j in range(i)]
     couplings = [Coupling(pair, draw(numbers), draw(st.floats(0, 1e9))) for pair in pairs]
     return MachineModel(tuple(axes), tuple(couplings), tuple(draw(st.lists(effects, max_size=2))))

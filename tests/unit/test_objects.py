@@ -142,7 +142,8 @@ def test_addresses_survive(index: int, sub: int) -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ["", "x", "0x2010:", "0x2010:01:02", "0x10000", "0x0", "0x2010:100", "-0x10", "0x2010.1"]
+    "text",
+    ["", "x", "0x2010:", "0x2010:01:02", "0x10000", "0x0", "0x2010:100", "-0x10", "0x2010.1"],
 )
 def test_what_is_no_address_is_refused(text: str) -> None:
     with pytest.raises(ValueError, match=r"no object address|outside 0x0001:00"):

@@ -22,7 +22,10 @@ RandomModel = Callable[..., MachineModel]
 
 
 def axis(
-    masses: tuple[float, ...], springs: tuple[float, ...], dampers: tuple[float, ...], name: str = "x"
+    masses: tuple[float, ...],
+    springs: tuple[float, ...],
+    dampers: tuple[float, ...],
+    name: str = "x",
 ) -> AxisModel:
     return AxisModel(
         name,
@@ -142,6 +145,15 @@ def test_the_peak_is_found_far_below_the_modes(fast: float) -> None:
         assert found == pytest.approx(1 / nyquist_distance(model, loops, k), rel=0.02)
 
 
+def test_a_rigid_axis_beside_an_elastic_one_gets_no_notch() -> None:
+    model = MachineModel((axis((3.0,), (), ()), axis((2.0, 1.0), (900.0,), (1.0,), "y")))
+    rigid, elastic = design(model).axes
+    assert rigid.parameters["filter1_type"] == 0.0
+    assert rigid.parameters["velocity_p"] == pytest.approx(3 * 2 * np.pi * 8)
+    alone = design(MachineModel(model.axes[1:])).axes[0]
+    assert dict(elastic.parameters) == pytest.approx(dict(alone.parameters))
+
+
 def test_the_lowest_antiresonance_is_the_chain_with_its_motor_held() -> None:
     chain = axis((2.0, 3.0, 4.0), (500.0, 700.0), (0.1, 0.1))
     M, K = np.diag([3.0, 4.0]), np.array([[1200.0, -700.0], [-700.0, 700.0]])
@@ -174,7 +186,7 @@ def test_a_machine_that_nothing_can_hold_is_refused() -> None:
     negative = replace(model, couplings=())
     negative = replace(
         negative,
-        axes=(axis((1.0, 1.0), (500.0,), (-3.0,)), negative.axes[1]),
+        axes=(axis((1.0, 1.0), (500.0,), (-60.0,)), negative.axes[1]),
     )
     with pytest.raises(DesignError, match="nothing is written"):
         design(negative)

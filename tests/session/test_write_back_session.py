@@ -1,0 +1,376 @@
+"""Write-back through the bus: nothing changes unasked, all or nothing, undoable, and told."""
+
+import json
+from dataclasses import dataclass
+
+import pytest
+import yaml
+
+from drives.sim.faults import (
+    Fault,
+    NodeVanishes,
+    PowerLoss,
+    SdoRefused,
+    SdoSilent,
+    StoreFails,
+    WriteAltered,
+)
+
+TABLE, ARM = 11, 12
+VELOCITY_P, VELOCITY_I, POSITION_P = (0x2010, 2), (0x2010, 3), (0x2010, 1)
+NEW = {"velocity_p": 2.0, "velocity_i": 16.0, "position_p": 20.0}
+NEW_RAW = {VELOCITY_P: 2000, VELOCITY_I: 16_000, POSITION_P: 20_000}
+
+
+@pytest.fixture
+def session(bench):
+    """A session folder with a tuning for both axes."""
+    bench.out.mkdir()
+    (bench.out / "machine.yaml").write_text(bench.profile.read_text())
+    write_tuning(bench, NEW)
+    return bench
+
+
+def write_tuning(bench, parameters, axes=("table", "arm")):
+    tuning = {
+        "format": "fieldtool-tuning/1",
+        "axes": [
+            {"axis": a, "parameters": dict(parameters), "sensitivity_peak": 1.4, "reason": "test"}
+            for a in axes
+        ],
+    }
+    (bench.out / "tuning.yaml").write_text(yaml.safe_dump(tuning))
+
+
+def held(bench, node, *keys):
+    return {key: bench.machine.node(node).dictionary.read(*key) for key in keys or NEW_RAW}
+
+
+def old(bench, node):
+    return {key: bench.before[node][key] for key in NEW_RAW}
+
+
+def write(bench, *options):
+    return bench.command("write", bench.out, "--yes", *options)
+
+
+def power_cycle(bench):
+    for node in bench.machine.nodes:
+        node.power_cycle()
+
+
+@dataclass(frozen=True)
+class RefusedSecondTime(Fault):
+    """The first write of an entry is taken, but altered; every later one is refused."""
+
+    index: int = 0
+    subindex: int = 0
+
+    def set(self, machine, *, present):
+        written = []
+
+        def alter(value):
+            written.append(value)
+            machine.inject(SdoRefused(self.node_id, self.index, self.subindex, 0x08000022))
+            return value + 1
+
+        node = machine.node(self.node_id)
+        node.dictionary.alterations[self.index, self.subindex] = alter
+
+
+# --- asked and not asked -------------------------------------------------------------------------
+
+
+def test_a_whole_run_without_write_changes_nothing_in_any_drive(small_bench):
+    """Every object of every node, but for targets, actual values and the error history."""
+    bench = small_bench
+    stored = bench.stored()
+    outcome = bench.run("--json", "--yes", "--store")
+    assert outcome.code == 0, outcome.err
+    assert bench.changed() == {}
+    assert bench.stored() == stored
+    assert bench.powered() == {}
+    rows = json.loads(outcome.out)["parameters"]
+    assert rows
+    assert all(row["read_back"] is None for row in rows)
+    assert any(row["before"] != row["after"] for row in rows), "there was something to write"
+
+
+def test_a_whole_run_with_write_changes_the_parameters_and_nothing_else(small_bench):
+    bench = small_bench
+    outcome = bench.run("--json", "--write", "--yes")
+    assert outcome.code == 0, outcome.err
+    rows = json.loads(outcome.out)["parameters"]
+    assert [r["read_back"] for r in rows] == [r["after"] for r in rows]
+    changed = bench.changed()[TABLE]
+    assert set(changed) <= {f"0x20{k}:{s:02X}" for k in (10, 20, 21) for s in range(1, 8)}
+    assert "0x2010:02" in changed
+    assert "working memory only" in outcome.err
+    assert bench.stored() == {TABLE: {}}
+    assert bench.command("restore", bench.out).code == 0
+    assert bench.changed() == {}, "bit by bit"
+
+
+def test_nobody_to_ask_means_nothing_is_written(session):
+    outcome = session.command("write", session.out)
+    assert outcome.code == 0
+    assert "nobody to ask" in outcome.out + outcome.err
+    assert "Nothing was written" in outcome.out + outcome.err
+    assert session.changed() == {}
+
+
+def test_written_parameters_are_read_back(session):
+    outcome = write(session)
+    assert outcome.code == 0, outcome.err
+    assert held(session, TABLE) == held(session, ARM) == NEW_RAW
+    assert set(session.changed()[TABLE]) == {"0x2010:01", "0x2010:02", "0x2010:03"}
+    assert "working memory only" in outcome.out
+    assert "--store" in outcome.out
+
+
+# --- power cycle ---------------------------------------------------------------------------------
+
+
+def test_what_was_not_stored_is_gone_after_a_power_cycle_as_the_tool_said(session):
+    assert "a power cycle brings the old ones back" in " ".join(write(session).out.split())
+    power_cycle(session)
+    assert held(session, TABLE) == old(session, TABLE)
+
+
+def test_what_was_stored_survives_a_power_cycle_as_the_tool_said(session):
+    outcome = write(session, "--store")
+    assert outcome.code == 0
+    assert "survive a power cycle" in " ".join(outcome.out.split())
+    power_cycle(session)
+    assert held(session, TABLE) == held(session, ARM) == NEW_RAW
+    assert set(session.changed()[ARM]) == {"0x2010:01", "0x2010:02", "0x2010:03"}, (
+        "nothing temporary was stored with them"
+    )
+
+
+def test_a_store_that_fails_says_what_each_drive_holds(session):
+    session.inject(StoreFails(ARM))
+    outcome = write(session, "--store")
+    assert outcome.code == 7
+    assert "storing failed (arm, object 0x1010:01" in outcome.err
+    assert "table (node 11): stored" in outcome.err
+    assert "arm (node 12): in working memory only, not stored" in outcome.err
+    assert held(session, ARM) == NEW_RAW
+    power_cycle(session)
+    assert held(session, TABLE) == NEW_RAW
+    assert held(session, ARM) == old(session, ARM)
+
+
+# --- refused, altered, vanished ------------------------------------------------------------------
+
+
+def test_a_write_refused_in_the_middle_restores_every_drive(session):
+    session.inject(SdoRefused(ARM, *VELOCITY_I, 0x08000022))
+    session.machine.node(ARM).sdo.aborting.clear()
+    seen = []
+    dictionary = session.machine.node(ARM).dictionary
+    dictionary.guards[VELOCITY_I] = lambda v: seen.append(v) or 0x08000022
+    outcome = write(session)
+    assert outcome.code == 6, outcome.err
+    assert "arm, object 0x2010:03: the drive refused to write it" in outcome.err
+    assert "Nothing was changed: all parameters were restored and read back" in outcome.err
+    assert seen, "it came that far"
+    assert session.changed() == {}
+
+
+def test_a_value_kept_differently_restores_every_drive(session):
+    before = session.before[ARM][POSITION_P]
+    session.inject(WriteAltered(ARM, *POSITION_P, before))
+    outcome = write(session)
+    assert outcome.code == 6
+    assert (
+        f"arm, position_p, object 0x2010:01: wrote 20000, the drive holds {before}" in outcome.err
+    )
+    assert session.changed() == {}
+
+
+def test_what_can_not_be_restored_is_named_with_node_and_object(session):
+    session.inject(RefusedSecondTime(ARM, *POSITION_P))
+    outcome = write(session)
+    assert outcome.code == 7
+    assert "arm (node 12), position_p, 0x2010:01" in outcome.err
+    assert "fieldtool restore" in outcome.err
+    assert session.changed().keys() == {ARM}, "all that could be was restored"
+    assert set(session.changed()[ARM]) == {"0x2010:01"}
+    session.machine.node(ARM).sdo.aborting.clear()
+    session.machine.node(ARM).dictionary.alterations.clear()
+    assert session.command("restore", session.out).code == 0
+    assert session.changed() == {}
+
+
+def test_a_drive_that_vanishes_while_it_is_written_is_named(session):
+    dictionary = session.machine.node(ARM).dictionary
+    dictionary.guards[VELOCITY_I] = lambda _: session.inject(NodeVanishes(ARM))
+    outcome = write(session)
+    assert outcome.code == 7
+    assert "arm (node 12), velocity_p, 0x2010:02 holds not known" in outcome.err
+    assert TABLE not in session.changed(), "the other drive was restored"
+
+
+def test_a_drive_that_reboots_while_it_is_written_holds_old_values_in_the_end(session):
+    dictionary = session.machine.node(ARM).dictionary
+    dictionary.alterations[VELOCITY_I] = lambda v: session.inject(PowerLoss(ARM)) or v
+    outcome = write(session)
+    assert outcome.code == 6, outcome.err
+    assert session.changed() == {}
+
+
+def test_ctrl_c_while_writing_restores_everything(session):
+    import signal
+
+    dictionary = session.machine.node(ARM).dictionary
+    dictionary.guards[VELOCITY_I] = lambda _: signal.raise_signal(signal.SIGINT)
+    outcome = write(session)
+    assert outcome.code == 130, outcome.err
+    assert session.changed() == {}
+
+
+def test_an_enabled_drive_is_not_written(session):
+    node = session.machine.node(ARM)
+    for word in (0x06, 0x07, 0x0F):
+        node.motion.write_controlword(word)
+    assert session.powered() == {ARM: "OPERATION_ENABLED"}
+    outcome = write(session)
+    assert outcome.code == 3
+    assert "arm" in outcome.err
+    assert "enabled" in outcome.err
+    assert session.changed() == {}
+
+
+@pytest.mark.parametrize(
+    ("parameters", "axes", "sentence"),
+    [
+        ({"velocity_p": float("nan")}, ("table",), "table, velocity_p: nan is no number"),
+        ({"velocity_p": -1.0}, ("table",), "table, velocity_p, object 0x2010:02: -1"),
+        ({"velocity_p": 1e300}, ("table",), "does not fit the drive"),
+        ({"speed": 1.0}, ("arm",), "has no parameter speed"),
+        ({"velocity_p": 1.0}, ("leg",), "axis leg, which this machine does not have"),
+    ],
+)
+def test_a_tuning_that_does_not_fit_is_refused_before_any_write(
+    session, parameters, axes, sentence
+):
+    write_tuning(session, parameters, axes)
+    outcome = write(session)
+    assert outcome.code == 3, outcome.err
+    assert sentence in outcome.err
+    assert session.changed() == {}
+
+
+@pytest.mark.parametrize("text", ["", "[", "format: x", "format: fieldtool-tuning/1\naxes: 3"])
+def test_a_file_that_is_no_tuning_is_refused(session, text):
+    (session.out / "tuning.yaml").write_text(text)
+    outcome = write(session)
+    assert outcome.code == 2
+    assert "tuning.yaml" in outcome.err
+    assert session.changed() == {}
+
+
+# --- backup and restore --------------------------------------------------------------------------
+
+
+def test_a_second_write_does_not_lose_the_first_backup(session):
+    """The backup holds what the drives held before the tool changed anything."""
+    assert write(session).code == 0
+    write_tuning(session, {"velocity_p": 3.0})
+    assert write(session).code == 0
+    assert (session.out / "parameters-before-2.yaml").is_file()
+    outcome = session.command("restore", session.out)
+    assert outcome.code == 0
+    assert "6 parameters differed" in outcome.out
+    assert session.changed() == {}
+
+
+def test_no_backup_no_write(session):
+    (session.out / "parameters-before.yaml.part").mkdir()
+    outcome = write(session)
+    assert outcome.code == 3
+    assert "backup" in outcome.err
+    assert "can not be written" in outcome.err
+    assert session.changed() == {}
+
+
+def test_restore_says_whether_it_is_stored(session):
+    write(session, "--store")
+    assert "working memory only" in session.command("restore", session.out).out
+    power_cycle(session)
+    assert held(session, TABLE) == NEW_RAW, "restored in memory only"
+    assert "stored too" in session.command("restore", session.out, "--store").out
+    power_cycle(session)
+    assert session.changed() == {}
+
+
+def test_restore_brings_back_objects_that_the_tool_never_writes(session):
+    write(session)
+    node = session.machine.node(ARM)
+    node.dictionary.write(0x6065, 0, 777)
+    node.dictionary.write(0x605A, 0, 5)
+    outcome = session.command("restore", session.out / "parameters-before.yaml")
+    assert outcome.code == 0, outcome.err
+    assert "8 parameters differed" in outcome.out
+    assert session.changed() == {}
+
+
+def test_a_backup_of_another_drive_is_refused(session, make_bench):
+    write(session)
+    backup = session.out / "parameters-before.yaml"
+    other = make_bench(session.data | {}, serial=9999)
+    other.rewrite(other.data)
+    outcome = other.command("restore", backup, "--machine", other.profile)
+    assert outcome.code == 3
+    assert "serial number 1011, this one has 9999" in outcome.err
+    assert other.changed() == {}
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda text: text[: len(text) // 2],
+        lambda text: text[: text.rindex("- object:")],
+        lambda text: text.replace("value: 1200\n", "value: 1300\n", 1),
+        lambda text: text.replace("UNSIGNED32", "UNSIGNED33", 1),
+        lambda text: text.replace("drives:", "drive:"),
+        lambda text: text.replace("checksum:", "sum:"),
+        lambda text: text.replace("value: 1200\n", "value: [1]\n", 1),
+        lambda text: text.replace("object: '0x2010:02'", "object: 12", 1),
+        lambda text: text.replace("node_id: 11", "node_id: .inf"),
+        lambda text: text.replace("fieldtool-parameters/1", "fieldtool-parameters/9"),
+        lambda _: "",
+        lambda _: "\x00\x01",
+        lambda _: "a: &a [*a]",
+    ],
+)
+def test_a_damaged_backup_is_refused_whole(session, damage):
+    write(session)
+    backup = session.out / "parameters-before.yaml"
+    text = backup.read_text()
+    assert damage(text) != text
+    backup.write_text(damage(text))
+    before = session.changed()
+    outcome = session.command("restore", backup)
+    assert outcome.code == 2, outcome.err
+    assert "parameters-before.yaml" in outcome.err
+    assert session.changed() == before, "nothing was written"
+
+
+def test_a_restore_that_can_not_be_whole_names_what_is_missing(session):
+    write(session)
+    session.inject(SdoSilent(ARM, *VELOCITY_P))
+    outcome = session.command("restore", session.out)
+    assert outcome.code == 7
+    assert "arm (node 12)" in outcome.err
+    assert "0x2010:02 holds not known" in outcome.err
+    assert "Everything else was" in outcome.err
+    assert set(session.changed()) == {ARM}
+    assert set(session.changed()[ARM]) == {"0x2010:02"}
+
+
+def test_no_backup_to_restore(session):
+    outcome = session.command("restore", session.out)
+    assert outcome.code == 2
+    assert "parameters-before.yaml" in outcome.err
