@@ -201,7 +201,29 @@ ENCODER_COUNTS = _standard(0x608F, 1, "UNSIGNED32", "encoder increments")
 ENCODER_REVOLUTIONS = _standard(0x608F, 2, "UNSIGNED32", "motor revolutions")
 GEAR_MOTOR = _standard(0x6091, 1, "UNSIGNED32", "gear: motor revolutions")
 GEAR_SHAFT = _standard(0x6091, 2, "UNSIGNED32", "gear: shaft revolutions")
+FEED_CONSTANT = _standard(0x6092, 1, "UNSIGNED32", "feed constant: feed")
+FEED_REVOLUTIONS = _standard(0x6092, 2, "UNSIGNED32", "feed constant: shaft revolutions")
 INTERPOLATION_VALUE = _standard(0x60C2, 1, "UNSIGNED8", "interpolation time period value")
 INTERPOLATION_INDEX = _standard(0x60C2, 2, "INTEGER8", "interpolation time index")
 SUPPORTED_MODES = _standard(0x6502, 0, "UNSIGNED32", "supported drive modes")
 SYNC_PERIOD = _standard(0x1006, 0, "UNSIGNED32", "communication cycle period")
+
+COMMANDS = frozenset(
+    {
+        0x1003,
+        0x1010,
+        0x1011,
+        0x6040,
+        0x6060,
+        0x6071,
+        0x607A,
+        0x60B0,
+        0x60B1,
+        0x60B2,
+        0x60C1,
+        0x60FE,
+        0x60FF,
+    }
+)
+"""Indexes of writable objects that command something (motion, outputs, storing) on every drive:
+they are never backed up nor restored, whatever a profile says."""

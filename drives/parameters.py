@@ -39,6 +39,8 @@ MAX_BACKUP_BYTES = 30_000_000
 """A drive has some thousand objects of 100 bytes here; a machine at most 32 drives."""
 SAVE_SIGNATURE = int.from_bytes(b"save", "little")
 DISABLED_STATES = (PowerState.SWITCH_ON_DISABLED, PowerState.READY_TO_SWITCH_ON)
+COARSEST = 0.02
+"""Relative change of a value by the drive's resolution above which it is not written."""
 Raw = int | float | str
 
 
@@ -319,6 +321,12 @@ def planned_changes(drive: CanopenDrive, wanted: Mapping[str, float]) -> tuple[C
                 f"{drive.axis}, {name}, object {parameter.object}: {value:g} {unit} does not fit "
                 f"the drive ({error}). Nothing was written."
             ) from None
+        if abs(float(held) * parameter.scale - value) > COARSEST * abs(value):
+            raise NotSupportedError(
+                f"{drive.axis}, {name}, object {parameter.object}: the drive holds it in steps of "
+                f"{parameter.scale:g} {unit}, which is too coarse for {value:.3g} {unit}. Nothing was "
+                "written."
+            )
         before = _number(drive, parameter)
         changes.append(
             Change(
@@ -474,13 +482,13 @@ def restore(drives: Sequence[CanopenDrive], backup: Backup) -> tuple[HeldObject,
             done, failed = _restore_drive(by_axis[part.axis], part)
             written += done
             holds |= failed
-    if holds:
-        listed = "; ".join(f"{place} holds {what}" for place, what in holds.items())
-        raise WriteBackMixedError(
-            f"not everything could be restored: {listed}. Everything else was. Do not run the "
-            "machine; try again once the drives answer.",
-            holds,
-        )
+        if holds:  # said before a stop that was asked for meanwhile
+            listed = "; ".join(f"{place} holds {what}" for place, what in holds.items())
+            raise WriteBackMixedError(
+                f"not everything could be restored: {listed}. Everything else was. Do not run the "
+                "machine; try again once the drives answer.",
+                holds,
+            )
     return tuple(written)
 
 
@@ -535,9 +543,11 @@ def store(drives: Sequence[CanopenDrive]) -> None:
             try:
                 with uninterrupted():
                     drive.write(info, SAVE_SIGNATURE, timeout=how.timeout)
+                    stored.append(drive.axis)
             except DrivesError as error:
+                if isinstance(error, StoppedError) and len(stored) == len(drives):
+                    raise
                 raise _not_stored(drives, stored, error) from error
-            stored.append(drive.axis)
 
 
 def _not_stored(

@@ -206,7 +206,8 @@ class AxisProfile(_Part):
     """Whether the axis may be without torque while others move; never for gravity axes."""
     serial_number: int | None = None
     feed: Positive | None = None
-    """Metres per shaft revolution; linear axes only."""
+    """Metres per encoder revolution (0x608F) of a linear motor's scale; linear axes only.  A screw
+    driven by a rotary motor is a rotary axis here: torques are those of the motor."""
     motor_inertia: MotorInertia | None = None
     limits: Limits
     prior: ChainProfile

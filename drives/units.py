@@ -92,9 +92,7 @@ class AxisScaling:
         return round(value / self.torque)
 
 
-def position_factor(
-    kind: Kind, counts: int, revolutions: int, gear: tuple[int, int], feed: float | None
-) -> float:
+def position_factor(kind: Kind, counts: int, revolutions: int, feed: float | None) -> float:
     """Return rad (or m) of the axis per position unit.
 
     Parameters
@@ -103,26 +101,21 @@ def position_factor(
         Of the axis.
     counts, revolutions
         0x608F: encoder increments in so many motor revolutions.
-    gear
-        0x6091: (motor revolutions, shaft revolutions).
     feed
-        Metres per shaft revolution; needed on linear axes only.
+        Metres per encoder revolution of a linear motor's scale; needed on linear axes only.
 
     Raises
     ------
     ValueError
         If a number is zero, or the feed of a linear axis is not known.
     """
-    if min(counts, revolutions, *gear) <= 0:
-        raise ValueError(
-            f"0x608F = {counts}/{revolutions} and 0x6091 = {gear[0]}/{gear[1]} must be positive"
-        )
-    shaft_revolutions = revolutions / counts * gear[1] / gear[0]
+    if min(counts, revolutions) <= 0:
+        raise ValueError(f"0x608F = {counts}/{revolutions} must be positive")
     if kind == "rotary":
-        return 2 * pi * shaft_revolutions
+        return 2 * pi * revolutions / counts
     if feed is None or feed <= 0:
         raise ValueError("a linear axis needs `feed` in the machine profile, metres a revolution")
-    return feed * shaft_revolutions
+    return feed * revolutions / counts
 
 
 _ON_LINEAR_AXES = {

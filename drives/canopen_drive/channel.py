@@ -6,7 +6,7 @@ position, actual torque.
 
 import struct
 from dataclasses import dataclass, field
-from math import floor
+from math import ceil, floor
 
 import can
 
@@ -22,6 +22,9 @@ MISSING_ALLOWED = 1
 """Cycles in a row in which a PDO may be missing."""
 HEARTBEATS_MISSED = 3.5
 """Heartbeat times after which a silent drive counts as lost."""
+SPAN_UNITS = 20
+"""The velocity is judged over so many cycles too that its limit is at least so many units: with a
+coarse encoder one unit a cycle is already much."""
 STUCK_SHARE, STUCK_UNITS, STUCK_TIME = 8, 20, 0.02
 """A target that moves by a part of the following error window, and by so many units at least,
 while the position does not change at all for so many seconds: the encoder is stuck, or the axis is
@@ -59,10 +62,17 @@ class Channel:
     hold: int | None = None
     """Where it was first seen enabled, position units: its target until others are streamed."""
     anchor: int | None = None
-    """Target when the position changed last."""
+    """Target when the position, or the target itself, stood last."""
     still: int = 0
     """Samples in a row with the same position."""
     still_allowed: int = 20
+    span: int = 1
+    """Cycles over which the velocity is judged too: as many as the resolution needs."""
+    span_units: int = 0
+    """Largest change of position units over that span."""
+    span_begin: int | None = None
+    span_count: int = 0
+    too_fast: bool = False
 
     @property
     def state(self) -> PowerState | None:
@@ -89,12 +99,22 @@ class Channel:
         if self.position != self.previous:
             self.anchor, self.still = None, 0
         self.allowed = self.step * (1 + self.missing)
+        self._judge_span(1 + self.missing)
         self.missing = 0
+
+    def _judge_span(self, cycles: int) -> None:
+        if self.span_begin is None:
+            self.span_begin = self.position
+        self.span_count += cycles
+        if self.span_count >= self.span:
+            share = self.span_count / self.span
+            self.too_fast = abs(self.position - self.span_begin) > self.span_units * share
+            self.span_begin, self.span_count = self.position, 0
 
     def is_stuck(self, target: int) -> bool:
         """Whether the position stands while the target moves."""
-        if self.anchor is None:
-            self.anchor = target
+        if self.anchor is None or target == self.anchor:
+            self.anchor, self.still = target, 0  # counted from where the target begins to move
         if self.free or self.still < self.still_allowed:
             return False
         return abs(target - self.anchor) > max(self.window // STUCK_SHARE, STUCK_UNITS)
@@ -107,6 +127,7 @@ class Channel:
             and self.low <= position <= self.high
             and -self.torque <= torque <= self.torque
             and -self.allowed <= position - self.previous <= self.allowed
+            and not self.too_fast
             and (self.free or -self.window <= target - position <= self.window)
             and not self.is_stuck(target)
             and not self.emergencies
@@ -167,6 +188,11 @@ class Channel:
                 f"{limits.velocity:g} {unit}/s; all axes were stopped. Does the axis move the wrong "
                 "way?"
             )
+        if self.too_fast:
+            return (
+                f"{drive.axis}: velocity over {self.span} cycles is above the limit "
+                f"{limits.velocity:g} {unit}/s; all axes were stopped. Does the axis move the wrong way?"
+            )
         return (
             f"{drive.axis}: node {drive.node_id} sent no heartbeat for "
             f"{HEARTBEATS_MISSED * DRIVE_HEARTBEAT:.2g} s; all axes were stopped. Check its supply "
@@ -191,13 +217,17 @@ class Channel:
 def channel_of(drive: CanopenDrive, cycle_time: float, free: bool) -> Channel:
     """Return the run-time state of an axis about to be moved, its limits in drive units."""
     scale, limits = drive.scaling, drive.limits
+    units = min(limits.velocity * cycle_time / scale.velocity, _MOST_UNITS)
+    span = ceil(SPAN_UNITS / units)
     return Channel(
         drive,
         free,
         can.Message(arbitration_id=0x200 + drive.node_id, data=bytes(8), is_extended_id=False),
         low=scale.position_units(limits.travel[0]),
         high=scale.position_units(limits.travel[1]),
-        step=max(2, 1 + floor(min(limits.velocity * cycle_time / scale.velocity, _MOST_UNITS))),
+        step=max(2, 1 + floor(units)),
+        span=span,
+        span_units=1 + floor(units * span),
         torque=floor(min(limits.torque / scale.torque * (1 + 1e-12), _MOST_UNITS)),
         still_allowed=max(3, round(STUCK_TIME / cycle_time)),
         window=floor(min(limits.following_error / scale.position * (1 + 1e-12), _MOST_UNITS)),

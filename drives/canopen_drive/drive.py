@@ -3,7 +3,7 @@
 import logging
 import struct
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 from canopen.objectdictionary import (
     ObjectDictionary,
@@ -39,6 +39,7 @@ from drives.units import AxisScaling, position_factor
 logging.getLogger("canopen").setLevel(logging.CRITICAL)  # what goes wrong is raised, not logged
 
 CIA402_DEVICE = 402
+STOP_NODE = 0x02
 _TYPE_OF_CODE: dict[int, DataType] = {
     getattr(datatypes, name): name for name in DATA_TYPES if hasattr(datatypes, name)
 }
@@ -125,7 +126,8 @@ class CanopenDrive:
         """Yield every object that the EDS calls writable and that is a parameter, not a command.
 
         Objects of the communication profile stay out from 0x1200 to 0x1FFF (SDO and PDO set-up
-        belongs to whoever uses the bus), and so do the profile's ``volatile_commands``.
+        belongs to whoever uses the bus), and so do ``objects.COMMANDS`` and the profile's
+        ``volatile_commands``.
         """
         for index in sorted(self.dictionary):
             if 0x1200 <= index < 0x2000:
@@ -138,6 +140,7 @@ class CanopenDrive:
                 if (
                     info is not None
                     and variable.access_type in ("rw", "rww", "rwr")
+                    and address.index not in objects.COMMANDS
                     and address not in self.profile.volatile_commands
                 ):
                     yield info
@@ -313,16 +316,36 @@ class CanopenDrive:
         self._rated_torque = rated * self.profile.rated_torque_unit
         counts = self.read_optional(objects.ENCODER_COUNTS) or 0
         revolutions = self.read_optional(objects.ENCODER_REVOLUTIONS) or 1
-        gear = (
-            self.read_optional(objects.GEAR_MOTOR) or 1,
-            self.read_optional(objects.GEAR_SHAFT) or 1,
-        )
+        self._refuse_user_units(counts, revolutions)
         try:
-            position = position_factor(self._axis.kind, counts, revolutions, gear, self._axis.feed)
+            position = position_factor(self._axis.kind, counts, revolutions, self._axis.feed)
         except ValueError as error:
             raise NotSupportedError(f"{self.axis}: position has no scale: {error}.") from None
         self._scaling = AxisScaling(position, position, self._rated_torque / 1000)
         return self._scaling
+
+    def _refuse_user_units(self, counts: int, revolutions: int) -> None:
+        """Refuse a drive whose positions are not those of its motor, while its torques are.
+
+        A gear (0x6091) or a feed constant (0x6092) puts positions on another side than torques;
+        masses would then be wrong by the ratio, and limits would be those of something else.
+        """
+        motor = self.read_optional(objects.GEAR_MOTOR) or 1
+        shaft = self.read_optional(objects.GEAR_SHAFT) or 1
+        if motor != shaft:
+            raise NotSupportedError(
+                f"{self.axis}: the drive's gear ratio 0x6091 is {motor}/{shaft}, so its positions are "
+                "those behind the gear and its torques those of the motor. Set it to 1/1 for "
+                "commissioning, and give limits and masses as the motor sees them."
+            )
+        feed = self.read_optional(objects.FEED_CONSTANT)
+        per = self.read_optional(objects.FEED_REVOLUTIONS) or 1
+        if feed and feed * revolutions != counts * per:
+            raise NotSupportedError(
+                f"{self.axis}: the drive's feed constant 0x6092 is {feed}/{per} position units a "
+                f"revolution, its encoder 0x608F has {counts}/{revolutions}. Positions would have two "
+                "scales; set the feed constant to the encoder's increments for commissioning."
+            )
 
     def check_limits(self) -> None:
         """Refuse limits that the drive's units can not express: they could not be watched.
@@ -393,6 +416,19 @@ class CanopenDrive:
         except DrivesError:
             return "not readable"
         return emergency_text(code & 0xFFFF) if code else "not recorded"
+
+    def switch_off(self) -> int | None:
+        """Write controlword 0 and return the statusword then, by SDO; None if there is no answer."""
+        try:
+            self.write(objects.CONTROLWORD, 0)
+            return self.read_int(objects.STATUSWORD)
+        except DrivesError:
+            return None
+
+    def stop_node(self) -> None:
+        """Send NMT stop to the node; a bus that does not take it changes nothing."""
+        with suppress(DrivesError):
+            self.node.nmt.send_command(STOP_NODE)
 
     def check_mode(self, mode: Mode) -> None:
         """Refuse a mode that 0x6502 does not offer.

@@ -1,7 +1,7 @@
 """All drives of a machine: connected, checked, and put back as they were."""
 
 import sys
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 
 import can
@@ -18,6 +18,8 @@ from drives.objects import ObjectInfo
 from drives.profile import DriveProfile, MachineProfile, load_drive
 
 START_NODE, ENTER_PRE_OPERATIONAL = 0x01, 0x80
+LISTENING_TIME = 0.3
+"""Seconds for which the bus is listened to before anything is changed."""
 
 
 def _never() -> bool:
@@ -64,9 +66,15 @@ class CanopenGroup:
 
         Raises
         ------
+        NotSupportedError
+            If a drive lacks a mode that measuring needs: better known before anything moves.
         SdoError, NotSupportedError
             If a drive does not take it; then those before have their old values again.
         """
+        for drive in self._drives:
+            drive.check_mode(Mode.CYCLIC_POSITION)
+            if drive.axis_profile.may_float and len(self._drives) > 1:
+                drive.check_mode(Mode.CYCLIC_TORQUE)
         with ExitStack() as stack:
             for drive in self._drives:
                 changes = self._changes(stack, drive)
@@ -105,8 +113,11 @@ class CanopenGroup:
                 setup.mode(drive, mode, changes)
                 setup.process_data(drive, changes)
             stack.callback(self.line.end_heartbeat)
+            unsure: dict[str, str] = {}
             for drive in self._drives:  # last, and so first to be put back
-                setup.fail_safe(drive, self._changes(stack, drive))
+                changes = setup.TemporaryObjects(drive)
+                stack.callback(self._disarm, changes, drive, unsure)
+                setup.fail_safe(drive, changes)
             for drive in self._drives:
                 stack.callback(self._leave_operational, drive)
             for drive in self._drives:
@@ -114,6 +125,7 @@ class CanopenGroup:
             motion = CanopenMotion(
                 self.line, self._drives, cycle_time, frozenset(free), self._stop_requested
             )
+            motion.perhaps_enabled = unsure
             self.line.begin_heartbeat(setup.HOST_NODE_ID, setup.HOST_HEARTBEAT)
             stack.callback(self._note_late_cycles, motion)
             stack.callback(motion.end)
@@ -160,6 +172,18 @@ class CanopenGroup:
             self._warn(f"could not be put back: {text}")
             if error is not None:
                 error.add_note(f"could not be put back: {text}")
+
+    def _disarm(
+        self, changes: setup.TemporaryObjects, drive: CanopenDrive, unsure: Mapping[str, str]
+    ) -> None:
+        """Put the fail-safe objects back, but not while they may be all that stops a drive."""
+        if drive.axis in unsure:
+            self._warn(
+                f"{drive.axis}: its fail-safe objects (0x1016, 0x6007, 0x1029) were left armed, because "
+                "the drive may still be enabled. Switch the drive off and on."
+            )
+        else:
+            self._put_back(changes)
 
     def _note_late_cycles(self, motion: CanopenMotion) -> None:
         self.late_cycles += motion.late_cycles
@@ -214,6 +238,7 @@ def connect(
         drives = [CanopenDrive(line, axis, profiles[axis.drive]) for axis in machine.axes]
         for drive in drives:
             drive.identify()
+        _check_alone(line, drives)
         for drive in drives:
             drive.check_idle()
             drive.read_scaling()
@@ -224,3 +249,24 @@ def connect(
             del line[node_id]
         if own is not None:
             own.shutdown()
+
+
+def _check_alone(line: Line, drives: Sequence[CanopenDrive]) -> None:
+    """Listen for a while, and refuse a bus on which somebody else commands.
+
+    Raises
+    ------
+    NothingMovedError
+        Naming the frame: a SYNC, the host's own heartbeat, or targets for one of our drives.
+    """
+    commands = {0x080: "a SYNC", 0x700 + setup.HOST_NODE_ID: "the host's own heartbeat"}
+    for drive in drives:
+        for base in (0x200, 0x300, 0x400, 0x500):
+            commands[base + drive.node_id] = f"targets (a PDO) for {drive.axis}"
+    heard = line.listen(LISTENING_TIME)
+    foreign = [text for cob_id, text in commands.items() if cob_id in heard]
+    if foreign:
+        raise NothingMovedError(
+            f"somebody else sends {' and '.join(foreign)} on this bus; two masters must not command "
+            "one machine. Stop the other controller first."
+        )

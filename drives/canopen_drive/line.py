@@ -16,6 +16,7 @@ from drives.bus import Clock, clock_of
 from drives.errors import BusError
 
 NMT_OPERATIONAL = 5
+EMERGENCY_IDS, EMERGENCY_BYTES, HEARTBEAT_ID = (0x81, 0xFF), 8, 0x700
 SHORTEST_WAIT = 1e-4
 """Seconds; a difference of two times may be smaller than a clock can tell."""
 SDO_TIMEOUT = 0.5
@@ -78,9 +79,29 @@ class Line(canopen.Network):  # type: ignore[misc]
             message = self.can_bus.recv(timeout)
         except (can.CanError, OSError) as error:
             raise BusError(f"the bus does not deliver frames any more: {error}") from error
-        if message is not None and not (message.is_error_frame or message.is_remote_frame):
+        if message is not None and not (
+            message.is_error_frame or message.is_remote_frame or message.is_extended_id
+        ):
             self.notify(message.arbitration_id, message.data, message.timestamp)
         return message
+
+    def listen(self, seconds: float) -> frozenset[int]:
+        """Receive for so long, and return the identifiers that were heard."""
+        heard: set[int] = set()
+        deadline = self.clock.now() + seconds
+        while (left := deadline - self.clock.now()) > 0:
+            message = self.pump(max(SHORTEST_WAIT, left))
+            if message is not None and not message.is_extended_id:
+                heard.add(message.arbitration_id)
+        return frozenset(heard)
+
+    def notify(self, can_id: int, data: bytearray, timestamp: float) -> None:
+        """Hand a frame on to those who subscribed; one that is too short can not harm them."""
+        if EMERGENCY_IDS[0] <= can_id <= EMERGENCY_IDS[1] and len(data) < EMERGENCY_BYTES:
+            data = bytearray(data) + bytes(EMERGENCY_BYTES - len(data))
+        if can_id > HEARTBEAT_ID and not data:
+            return
+        super().notify(can_id, data, timestamp)
 
     def wait(self, seconds: float, until: Callable[[], bool] = lambda: False) -> bool:
         """Receive for so long, or until a condition holds; return whether it does."""

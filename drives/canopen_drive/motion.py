@@ -15,6 +15,7 @@ from drives.canopen_drive.channel import INPUT, OUTPUT, Channel, channel_of
 from drives.canopen_drive.drive import CanopenDrive
 from drives.canopen_drive.interrupts import uninterrupted
 from drives.canopen_drive.line import Line
+from drives.canopen_drive.setup import HOST_LOST_AFTER
 from drives.cia402 import ENABLED_VALUE, STEP_TOWARDS_ENABLED, Controlword, PowerState
 from drives.errors import (
     BusError,
@@ -35,6 +36,10 @@ STOP_TIMEOUT = 5.0
 RUNAWAY_SHARE, RUNAWAY_GROWTH, RUNAWAY_CYCLES = 0.25, 1.25, 3
 """An axis runs away that, for so many cycles of a quick stop, is faster than this share of its
 velocity limit and than it was at the start of the stop times the growth."""
+LATE_SHARE = 0.25
+"""Share of a cycle by which the host may be late; a block with a later cycle is measured again."""
+PAUSE_CYCLES, REPLY_TRIES = 3, 3
+"""Cycles without SYNC before the drives' replies are timed, and tries to find them in time."""
 REPLY_SHARE = 0.9
 """Share of the cycle within which the drives' PDOs have to come."""
 
@@ -58,8 +63,10 @@ class CanopenMotion:
         self._start = 0.0
         self._count = 0
         self._stopped = False
+        self.perhaps_enabled: dict[str, str] = {}
+        """Axes whose drive could not be seen to be off after a stop: a sentence each."""
         self.late_cycles = 0
-        """Cycles that the host began more than half a cycle late."""
+        """Cycles that the host began later than LATE_SHARE of a cycle."""
 
     # --- what the outside sees -----------------------------------------------------------------
 
@@ -116,8 +123,8 @@ class CanopenMotion:
             self._line.subscribe(0x80 + node_id, self._on_emergency)
             self._line.subscribe(0x700 + node_id, self._on_heartbeat)
         self._await_inputs()
-        for _ in STEP_TOWARDS_ENABLED:
-            self._towards_enabled()
+        self._check_replies()
+        self._towards_enabled()
         slow = [c for c in self._channels if c.state is not PowerState.OPERATION_ENABLED]
         if slow:
             raise DriveFaultError(
@@ -137,22 +144,33 @@ class CanopenMotion:
             "takes part in SYNC (0x1005) and reached NMT operational."
         )
 
+    def _check_replies(self) -> None:
+        """See that every drive answers a SYNC within its own cycle, not within the next one.
+
+        After a pause without SYNC nothing old is on its way; a PDO that comes too late would be
+        taken for the next cycle's ever after.
+        """
+        self._line.wait(PAUSE_CYCLES * self._cycle_time)
+        self._start = self._line.clock.now() + (1 - self._count) * self._cycle_time
+        words = [self._word(c, Controlword.DISABLE_VOLTAGE) for c in self._channels]
+        for _ in range(REPLY_TRIES):
+            if self._cycle(words):
+                return
+        late = next((c for c in self._channels if c.missing), self._channels[0])
+        raise DriveFaultError(
+            f"{late.drive.axis}: node {late.drive.node_id} answers a SYNC later than "
+            f"{REPLY_SHARE:g} of the cycle of {self._cycle_time * 1000:g} ms, or the bus is too slow "
+            "or disturbed. Nothing was moved. Check the bus load, or use a longer cycle."
+        )
+
     def _towards_enabled(self) -> None:
-        wanted = {}
-        for k, channel in enumerate(self._channels):
-            step = STEP_TOWARDS_ENABLED.get(channel.state) if channel.state else None
-            if step is not None:
-                wanted[k] = step
-        for _ in range(round(STATE_TIMEOUT / self._cycle_time)):
-            words = [
-                self._word(c, wanted[k][0] if k in wanted else Controlword.ENABLE_OPERATION)
-                for k, c in enumerate(self._channels)
-            ]
-            self._cycle(words)
+        """Lead every drive, state by state, to operation enabled; return when time is up."""
+        for _ in range(round(len(STEP_TOWARDS_ENABLED) * STATE_TIMEOUT / self._cycle_time)):
+            self._cycle([self._word(c, _next_word(c.state)) for c in self._channels])
             self._check_user()
             for channel in self._channels:
                 self._check_enabling(channel)
-            if all(self._channels[k].state is after for k, (_, after) in wanted.items()):
+            if all(c.state is PowerState.OPERATION_ENABLED for c in self._channels):
                 return
 
     def _check_enabling(self, channel: Channel) -> None:
@@ -180,6 +198,9 @@ class CanopenMotion:
                 with uninterrupted():
                     self._stopped = True
                     self._or_last_resort(lambda: self._disable(Controlword.SHUTDOWN))
+                    self._make_sure_off()
+                if self.perhaps_enabled:
+                    raise SafetyStopError(" ".join(self.perhaps_enabled.values()))
         finally:
             for channel in self._channels:
                 node_id = channel.drive.node_id
@@ -195,8 +216,39 @@ class CanopenMotion:
             return
         with uninterrupted():
             self._stopped = True
+            for channel in self._channels:
+                channel.hold = None  # from now on the target is where the axis is
             runaway = cause.axis if isinstance(cause, SafetyStopError) and cause.runaway else None
             self._or_last_resort(lambda: self._quick_stop(runaway))
+            self._make_sure_off()
+            if cause is not None:
+                for sentence in self.perhaps_enabled.values():
+                    cause.add_note(sentence)
+
+    def _make_sure_off(self) -> None:
+        """Believe only a fresh statusword; else switch off by SDO, and say what stays unknown.
+
+        The host's heartbeat ends for good where a drive may still be enabled: its own consumer is
+        then what stops it, so its fail-safe objects must stay as they are.
+        """
+        for channel in self._channels:
+            if not channel.missing and _is_off(channel.statusword):
+                continue
+            drive = channel.drive
+            state = drive.switch_off()
+            if state is None or not _is_off(state):
+                shown = "does not answer" if state is None else f"shows statusword 0x{state:04X}"
+                self.perhaps_enabled[drive.axis] = (
+                    f"{drive.axis}: node {drive.node_id} {shown} after it was told to switch off: it "
+                    "MAY STILL BE ENABLED. It has to stop by itself within "
+                    f"{HOST_LOST_AFTER:g} s, as it misses the host's heartbeat. Use the emergency "
+                    "stop before you go near it."
+                )
+        if self.perhaps_enabled:
+            self._line.end_heartbeat()
+            for channel in self._channels:
+                if channel.drive.axis in self.perhaps_enabled:
+                    channel.drive.stop_node()
 
     def _or_last_resort(self, action: Callable[[], None]) -> None:
         try:
@@ -237,24 +289,13 @@ class CanopenMotion:
         for word in dict.fromkeys((first, Controlword.DISABLE_VOLTAGE)):
             for _ in range(round(STATE_TIMEOUT / self._cycle_time)):
                 self._cycle([self._word(c, word) for c in self._channels])
-                if all(
-                    c.missing or c.statusword & 0x4F in (0x40, 0x08) or c.statusword & 0x6F == 0x21
-                    for c in self._channels
-                ):
+                if all(c.missing or _is_off(c.statusword) for c in self._channels):
                     break
 
     def _last_resort(self) -> None:
-        """The cyclic way failed: disable by SDO, then stop the nodes; their heartbeat does the rest."""
+        """The cyclic way failed: no statusword is fresh, and every drive is asked one by one."""
         for channel in self._channels:
-            try:
-                channel.drive.node.sdo.download(0x6040, 0, bytes(2))
-            except Exception:  # every other drive still has to be tried
-                continue
-        for channel in self._channels:
-            try:
-                channel.drive.node.nmt.send_command(0x02)
-            except Exception:
-                continue
+            channel.missing = max(channel.missing, 1)
 
     # --- the cycle -----------------------------------------------------------------------------
 
@@ -264,6 +305,7 @@ class CanopenMotion:
         first, n = self._count, targets.shape[0]
         received = [bytearray() for _ in self._channels]
         missing: list[int] = []
+        row = 0
         try:
             for row in range(n):
                 a, b = 8 * row, 8 * row + 8
@@ -274,6 +316,8 @@ class CanopenMotion:
                     missing.append(row)
                 self._check(units[row])
         finally:
+            for k, channel in enumerate(self._channels):
+                channel.hold = int(units[row, k])  # what was sent last stays the target
             captures.append(self._capture(first, targets, received, missing))
         return captures[-1]
 
@@ -294,6 +338,7 @@ class CanopenMotion:
             else:
                 wanted = np.rint(targets[:, k] / channel.drive.scaling.position)
                 self._check_inside(channel, wanted)
+                self._check_steps(channel, wanted)
                 units[:, k] = wanted
             rows["position"] = units[:, k]
             frames.append(rows.tobytes())
@@ -308,6 +353,21 @@ class CanopenMotion:
                 f"{drive.position_unit} is outside the travel {drive.limits.travel[0]:g} to "
                 f"{drive.limits.travel[1]:g} {drive.position_unit}; it was not sent, and all axes "
                 "were stopped.",
+                axis=drive.axis,
+                cycle=self._count,
+            )
+
+    def _check_steps(self, channel: Channel, wanted: FloatArray) -> None:
+        """Refuse a target further from the one before than a following error may be."""
+        begin = channel.position if channel.hold is None else channel.hold
+        steps = np.abs(np.diff(wanted, prepend=float(begin)))
+        if steps.size and steps.max() > channel.window:
+            drive = channel.drive
+            scale, unit = drive.scaling.position, drive.position_unit
+            raise SafetyStopError(
+                f"{drive.axis}: a target would jump by {steps.max() * scale:.4g} {unit} from one cycle "
+                f"to the next, more than the following error {channel.window * scale:.4g} {unit} that "
+                "is allowed; it was not sent, and all axes were stopped.",
                 axis=drive.axis,
                 cycle=self._count,
             )
@@ -339,20 +399,29 @@ class CanopenMotion:
         line.beat()
         clock.wait_until(moment - 1e-7)
         late = clock.now() - moment
-        if late > self._cycle_time / 2:
+        is_late = late > LATE_SHARE * self._cycle_time
+        if is_late:
             self.late_cycles += 1
             self._start += late
             moment += late
-        self._take_late_frames()
+        disturbed = self._take_late_frames()
         line.send(self._sync)
         self._count += 1
-        return self._collect(moment + REPLY_SHARE * self._cycle_time)
+        complete = self._collect(moment + REPLY_SHARE * self._cycle_time)
+        return complete and not is_late and not disturbed
 
-    def _take_late_frames(self) -> None:
-        """Hand on what came since the last cycle; a PDO that is late for its SYNC is dropped."""
+    def _take_late_frames(self) -> bool:
+        """Hand on what came since the last cycle; return whether a drive's PDO was among it.
+
+        That PDO came too late for its SYNC, or the drive answered a SYNC that is not ours.
+        """
+        disturbed = False
         while (message := self._receive(0.0)) is not None:
-            if message.arbitration_id not in self._by_cob:
+            if message.arbitration_id in self._by_cob and not message.is_extended_id:
+                disturbed = True
+            else:
                 self._hand_on(message)
+        return disturbed
 
     def _collect(self, deadline: float) -> bool:
         by_cob, channels, clock = self._by_cob, self._channels, self._line.clock
@@ -362,7 +431,7 @@ class CanopenMotion:
             if message is None:
                 break
             k = by_cob.get(message.arbitration_id)
-            if k is None or len(message.data) != INPUT.size:
+            if k is None or message.is_extended_id or len(message.data) != INPUT.size:
                 self._hand_on(message)
                 continue
             channels[k].take(bytes(message.data))
@@ -378,7 +447,7 @@ class CanopenMotion:
             raise BusError(f"the bus does not deliver frames any more: {error}") from error
 
     def _hand_on(self, message: can.Message) -> None:
-        if not (message.is_error_frame or message.is_remote_frame):
+        if not (message.is_error_frame or message.is_remote_frame or message.is_extended_id):
             self._line.notify(message.arbitration_id, message.data, message.timestamp)
 
     def _word(self, channel: Channel, word: Controlword) -> bytes:
@@ -418,6 +487,19 @@ class CanopenMotion:
                     cycle=self._count - 1,
                     runaway=channel.is_stuck(target),
                 )
+
+
+def _is_off(statusword: int) -> bool:
+    """Whether this statusword shows a power stage that is off."""
+    return statusword & 0x4F in (0x40, 0x08) or statusword & 0x6F in (0x21, 0x23)
+
+
+def _next_word(state: PowerState | None) -> Controlword:
+    """Return the controlword that leads from this state towards operation enabled."""
+    if state is PowerState.OPERATION_ENABLED:
+        return Controlword.ENABLE_OPERATION
+    step = STEP_TOWARDS_ENABLED.get(state) if state else None
+    return step[0] if step else Controlword.DISABLE_VOLTAGE
 
 
 def _still_moves(channel: Channel, moved: int) -> bool:

@@ -354,15 +354,15 @@ def run_plan(
                 _centre(motion, axes)
             teller = _Teller(report, number + 1, plan, done, machine_time)
             source = _SweepSource(sweep, first, axes, plan.cycle_time, teller)
-            with group.motion(plan.cycle_time, sweep.free) as motion:
-                source.start(motion.position)
-                try:
+            try:
+                with group.motion(plan.cycle_time, sweep.free) as motion:
+                    source.start(motion.position)
                     capture = motion.stream(source)
-                except StoppedError as error:
-                    if isinstance(error.capture, Capture) and error.capture.rows > 1:
-                        cut = source.experiment(error.capture, complete=False, note=str(error))
-                        _keep_whatever_happens([cut], keep, error)
-                    raise
+            except StoppedError as error:  # once the drives are off: writing to a disk takes time
+                if isinstance(error.capture, Capture) and error.capture.rows > 1:
+                    cut = source.experiment(error.capture, complete=False, note=str(error))
+                    _keep_whatever_happens([cut], keep, error)
+                raise
             machine_time += capture.rows * plan.cycle_time
             keep(source.experiment(capture))
             first = source.next_tone

@@ -9,7 +9,7 @@ from drives.parameters import Change, HeldObject, load_backup
 from drives.profile import MachineProfile, load_machine
 from fieldtool.design.tuning import Tuning, design
 from fieldtool.design.tuning_file import read_tuning, tuning_as_dict
-from fieldtool.errors import FileFormatError
+from fieldtool.errors import FileFormatError, OutputError
 from fieldtool.frf.response import save_responses
 from fieldtool.identify.recorded import Identified, identify_recording
 from fieldtool.records.model import Estimate, MachineModel
@@ -223,17 +223,36 @@ def _write(
         return WriteBack((), changes, in_memory=False, stored=False, backup=None)
     session.screen.stage("Write the new parameters, and read them back")
     backup = folder.parameters_before
-    result = apply(session.machine.name, group.drives, tuning, backup, confirm, options.store)
+
+    def confirmed(changes: Sequence[Change]) -> bool:
+        """Ask, and have the journal on the disk before the first write."""
+        if not confirm(changes):
+            return False
+        planned = WriteBack((), tuple(changes), in_memory=False, stored=False, backup=backup)
+        _journal(
+            session, planned, "begun: what the drives hold now is not known until they are read"
+        )
+        return True
+
+    result = apply(session.machine.name, group.drives, tuning, backup, confirmed, options.store)
+    try:
+        _journal(session, result, "ended")
+    except OutputError as error:
+        session.warn(f"{error} {result.sentence}")
+    session.screen.say(result.sentence)
+    return result
+
+
+def _journal(session: Session, result: WriteBack, state: str) -> None:
     write_yaml(
-        folder.journal,
+        session.folder.journal,
         {
             "format": "fieldtool-write-journal/1",
             "machine": session.machine.name,
-            "backup": backup.name,
+            "state": state,
+            "backup": result.backup.name if result.backup else None,
             "in_memory": result.in_memory,
             "stored": result.stored,
             "parameters": parameter_table(result),
         },
     )
-    session.screen.say(result.sentence)
-    return result

@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import can
+import numpy as np
 import pytest
 import yaml
 
-from drives.canopen_drive import CanopenGroup, connect
+from drives.canopen_drive import connect
 from drives.profile import load_machine
 from drives.sim.entries import ENTRIES
 from drives.sim.faults import Fault
@@ -105,6 +106,10 @@ def two_axes() -> dict[str, Any]:
     return machine
 
 
+def _as_on_the_wire(value: Any) -> Any:
+    return float(np.float32(value)) if isinstance(value, float) else value
+
+
 @dataclass(frozen=True)
 class Outcome:
     """What a command came to."""
@@ -195,7 +200,7 @@ class Bench:
         """Return every object of every node, but for what a motion changes by what it is."""
         return {
             node.node_id: {
-                key: node.dictionary.read(*key)
+                key: _as_on_the_wire(node.dictionary.read(*key))
                 for key, entry in ENTRIES.items()
                 if entry.access != "wo" and key not in PROCESS_VALUES
             }
@@ -289,11 +294,7 @@ def profile_of_one() -> dict[str, Any]:
 
 
 @pytest.fixture
-def group_of() -> Callable[[Bench], Any]:
-    def enter(bench: Bench, stop: Callable[[], bool] = lambda: False) -> Any:
-        return bench.connected(stop)
-
-    return enter
-
-
-__all__ = ["CanopenGroup"]
+def quick_plan(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A coarser first pass: enough for one chain of two masses, in a third of the time."""
+    monkeypatch.setattr("fieldtool.experiment.classic.GRID_RATIO", 1.25)
+    monkeypatch.setattr("fieldtool.experiment.classic.HIGH_TONES", 4)

@@ -1,11 +1,13 @@
 """Write-back through the bus: nothing changes unasked, all or nothing, undoable, and told."""
 
 import json
+import signal
 from dataclasses import dataclass
 
 import pytest
 import yaml
 
+from drives.canopen_drive import CanopenDrive
 from drives.sim.faults import (
     Fault,
     NodeVanishes,
@@ -81,6 +83,7 @@ class RefusedSecondTime(Fault):
 # --- asked and not asked -------------------------------------------------------------------------
 
 
+@pytest.mark.usefixtures("quick_plan")
 def test_a_whole_run_without_write_changes_nothing_in_any_drive(small_bench):
     """Every object of every node, but for targets, actual values and the error history."""
     bench = small_bench
@@ -96,6 +99,7 @@ def test_a_whole_run_without_write_changes_nothing_in_any_drive(small_bench):
     assert any(row["before"] != row["after"] for row in rows), "there was something to write"
 
 
+@pytest.mark.usefixtures("quick_plan")
 def test_a_whole_run_with_write_changes_the_parameters_and_nothing_else(small_bench):
     bench = small_bench
     outcome = bench.run("--json", "--write", "--yes")
@@ -220,11 +224,18 @@ def test_a_drive_that_reboots_while_it_is_written_holds_old_values_in_the_end(se
     assert session.changed() == {}
 
 
-def test_ctrl_c_while_writing_restores_everything(session):
-    import signal
+@pytest.mark.parametrize("presses", [1, 3])
+def test_ctrl_c_while_writing_restores_everything(session, monkeypatch, presses):
+    """However often it is pressed, also while old values are being restored."""
+    write_object, seen = CanopenDrive.write, []
 
-    dictionary = session.machine.node(ARM).dictionary
-    dictionary.guards[VELOCITY_I] = lambda _: signal.raise_signal(signal.SIGINT)
+    def pressing(drive, info, value, timeout=None):
+        write_object(drive, info, value, timeout)
+        seen.append(info.address)
+        if 4 <= len(seen) < 4 + presses:
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(CanopenDrive, "write", pressing)
     outcome = write(session)
     assert outcome.code == 130, outcome.err
     assert session.changed() == {}
@@ -337,7 +348,7 @@ def test_a_backup_of_another_drive_is_refused(session, make_bench):
         lambda text: text.replace("drives:", "drive:"),
         lambda text: text.replace("checksum:", "sum:"),
         lambda text: text.replace("value: 1200\n", "value: [1]\n", 1),
-        lambda text: text.replace("object: '0x2010:02'", "object: 12", 1),
+        lambda text: text.replace("object: 0x2010:02", "object: 12", 1),
         lambda text: text.replace("node_id: 11", "node_id: .inf"),
         lambda text: text.replace("fieldtool-parameters/1", "fieldtool-parameters/9"),
         lambda _: "",

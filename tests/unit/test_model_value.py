@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fieldtool.records.model import AxisModel, Coupling, Estimate, MachineModel
+from fieldtool.records.model import AxisModel, Coupling, Estimate, Kind, MachineModel
 
 RandomModel = Callable[..., MachineModel]
 
@@ -117,7 +117,7 @@ def machines(draw: st.DrawFn) -> MachineModel:
         frictions = [f if f.value else Estimate(0.0) for f in frictions]
         masses = draw(st.lists(estimates, min_size=n, max_size=n))
         dampers = tuple(draw(few)) if draw(st.booleans()) else ()
-        kind = draw(st.sampled_from(["rotary", "linear"]))
+        kind: Kind = draw(st.sampled_from(("rotary", "linear")))
         axes.append(AxisModel(f"x{k}", kind, tuple(masses), tuple(draw(few)), dampers, *frictions))
     pairs = [(f"x{i}", f"x{j}") for i in range(len(axes)) for j in range(i)]
     couplings = [Coupling(pair, draw(numbers), draw(st.floats(0, 1e9))) for pair in pairs]
@@ -145,7 +145,8 @@ def test_plain_numbers_and_missing_parts() -> None:
     )
     assert model.axes[0].masses[1].value == 2.0
     assert model.axes[0].dampers == ()
-    assert model.couplings == model.effects == ()
+    assert model.couplings == ()
+    assert model.effects == ()
 
 
 def changed(**changes: Any) -> dict[str, Any]:

@@ -272,7 +272,9 @@ def test_an_overload_halves_the_amplitude_until_it_fits(what: str) -> None:
     )
     kept, told, _ = run(FakeGroup(machine(), np.zeros(2)), plan(3.0, amplitude=0.4), axes(limits))
     (segment,) = kept[0].segments
-    amplitude = np.abs(phasor(kept[0].position_reference[segment.start : segment.stop], 3.0)[0])
+    references = kept[0].position_reference
+    assert references is not None
+    amplitude = np.abs(phasor(references[segment.start : segment.stop], 3.0)[0])
     assert amplitude == pytest.approx(0.1, rel=1e-2)  # 0.4 and 0.2 are above 0.8 * 0.4, 0.1 is not
     assert told[-1].amplitude == pytest.approx(0.1)
     rows = slice(segment.start, segment.stop)

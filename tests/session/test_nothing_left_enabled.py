@@ -1,0 +1,201 @@
+"""After a motion, however it ended: off, or said so, with the drive's own fail-safe still armed."""
+
+import can
+import numpy as np
+import pytest
+
+from drives.errors import NothingMovedError, SafetyStopError
+from drives.sim.faults import SdoSilent
+
+TABLE, ARM = 11, 12
+HOLD = 400
+
+
+def held(position, cycles=HOLD):
+    targets = np.tile(position, (cycles, 1))
+    return lambda before: targets if before is None else None
+
+
+def node(bench, node_id):
+    return next(n for n in bench.machine.nodes if n.node_id == node_id)
+
+
+def test_a_drive_that_leaves_operational_is_switched_off_by_sdo(bench):
+    """Its PDOs are dead then, both ways; only an SDO can reach it."""
+    with (
+        bench.connected() as group,
+        pytest.raises(SafetyStopError, match="table: node 11") as stop,
+        group.motion(0.002) as motion,
+    ):
+        moved = False
+
+        def source(before):
+            nonlocal moved
+            if moved:
+                bench.machine.receive(0x000, bytes([0x80, TABLE]))  # somebody's NMT command
+            moved = True
+            return np.tile(motion.position, (50, 1))
+
+        motion.stream(source)
+    assert bench.powered() == {}
+    assert not [n for n in getattr(stop.value, "__notes__", []) if "MAY STILL" in n]
+    assert bench.changed() == {}
+
+
+def test_a_drive_that_can_not_be_switched_off_keeps_its_fail_safe(bench):
+    """Deaf to PDOs and to 0x6040 by SDO: only its own heartbeat consumer can stop it."""
+    bench.inject(SdoSilent(TABLE, 0x6040, 0))
+    with (
+        bench.connected() as group,
+        pytest.raises(SafetyStopError) as stop,
+        group.motion(0.002) as motion,
+    ):
+        begun = False
+
+        def source(before):
+            nonlocal begun
+            if begun:
+                bench.machine.receive(0x000, bytes([0x80, TABLE]))
+            begun = True
+            return np.tile(motion.position, (50, 1))
+
+        motion.stream(source)
+    notes = " ".join(getattr(stop.value, "__notes__", []))
+    assert "table: node 11 does not answer" in notes
+    assert "MAY STILL BE ENABLED" in notes
+    assert "emergency stop" in notes
+    assert any("left armed" in text for text in group.warnings)
+    assert node(bench, TABLE).dictionary.read(0x1016, 1) != 0
+    with bench.connected() as again:  # time passes, and no heartbeat comes
+        again.line.wait(1.0)
+    assert bench.powered() == {}
+
+
+def test_the_last_target_stays_the_target_while_the_axis_is_switched_off(bench):
+    bench.listen()
+    with bench.connected() as group, group.motion(0.002) as motion:
+        ramp = np.zeros((800, 2))
+        ramp[:, 0] = 0.5 * (1 - np.cos(np.pi * np.arange(800) / 799)) / 2
+        motion.stream(lambda before: motion.position + ramp if before is None else None)
+        reached = motion.position[0]
+    outputs = [f.data for f in bench.heard() if f.cob_id == 0x200 + TABLE]
+    unit = 2 * np.pi / 2**20
+    targets = [int.from_bytes(data[2:6], "little", signed=True) * unit for data in outputs]
+    words = [int.from_bytes(data[0:2], "little") for data in outputs]
+    last_enabled = max(k for k, word in enumerate(words) if word == 0x0F)
+    assert reached == pytest.approx(0.5, abs=0.02)
+    assert len(targets) > last_enabled + 1
+    assert targets[last_enabled + 1 :] == pytest.approx([0.5] * len(targets[last_enabled + 1 :]))
+
+
+def test_a_target_that_jumps_is_never_sent(bench):
+    bench.listen()
+    with (
+        bench.connected() as group,
+        pytest.raises(SafetyStopError, match="table: a target would jump by 1 rad"),
+        group.motion(0.002) as motion,
+    ):
+        targets = np.tile(motion.position, (10, 1))
+        targets[5:, 0] += 1.0
+        motion.stream(lambda before: targets if before is None else None)
+    unit = 2 * np.pi / 2**20
+    sent = [
+        int.from_bytes(f.data[2:6], "little", signed=True) * unit
+        for f in bench.heard()
+        if f.cob_id == 0x200 + TABLE
+    ]
+    assert max(abs(target) for target in sent) < 0.1
+    assert bench.powered() == {}
+
+
+@pytest.mark.parametrize("state", [0x06, 0x07])
+def test_a_drive_that_was_left_ready_is_enabled_all_the_same(bench, state):
+    """Somebody left it in ready to switch on, or switched on."""
+    bench.machine.receive(0x600 + TABLE, bytes([0x2B, 0x40, 0x60, 0, 0x06, 0, 0, 0]))
+    if state == 0x07:
+        bench.machine.receive(0x600 + TABLE, bytes([0x2B, 0x40, 0x60, 0, 0x07, 0, 0, 0]))
+    assert node(bench, TABLE).motion.state.name in ("READY_TO_SWITCH_ON", "SWITCHED_ON")
+    with bench.connected() as group, group.motion(0.002) as motion:
+        motion.stream(held(motion.position, 20))
+    assert bench.powered() == {}
+
+
+@pytest.mark.parametrize(
+    ("cob_id", "data", "said"),
+    [
+        (0x080, b"", "a SYNC"),
+        (0x77F, b"\x05", "the host's own heartbeat"),
+        (0x200 + ARM, bytes(8), "targets .* for arm"),
+    ],
+)
+def test_another_master_on_the_bus_is_refused(bench, cob_id, data, said):
+    other = can.Bus(interface="fieldsim", channel=bench.channel)
+    task = other.send_periodic(
+        can.Message(arbitration_id=cob_id, data=data, is_extended_id=False), 0.05
+    )
+    try:
+        with (
+            pytest.raises(NothingMovedError, match=f"somebody else sends {said}"),
+            bench.connected(),
+        ):
+            pass
+    finally:
+        task.stop()
+        other.shutdown()
+    assert bench.powered() == {}
+
+
+def test_a_sync_that_is_not_ours_spoils_its_rows(bench):
+    other = can.Bus(interface="fieldsim", channel=bench.channel)
+    try:
+        with bench.connected() as group, group.motion(0.002) as motion:
+            position = motion.position
+
+            def source(before):
+                if before is not None:
+                    return None
+                return np.tile(position, (60, 1))
+
+            clean = motion.stream(source)
+            assert clean.missing == ()
+            blocks = 0
+
+            def disturbed(before):
+                nonlocal blocks
+                blocks += 1
+                other.send(can.Message(arbitration_id=0x80, is_extended_id=False))
+                return np.tile(position, (10, 1)) if blocks < 4 else None
+
+            capture = motion.stream(disturbed)
+    finally:
+        other.shutdown()
+    assert capture.missing
+
+
+def test_short_emergencies_and_empty_heartbeats_do_no_harm(bench):
+    other = can.Bus(interface="fieldsim", channel=bench.channel)
+    try:
+        with (
+            bench.connected() as group,
+            pytest.raises(SafetyStopError, match="table: node 11 reports emergency 0x8130"),
+            group.motion(0.002) as motion,
+        ):
+            frames = [(0x700 + TABLE, b""), (0x080 + TABLE, b"\x30\x81")]
+
+            def source(before):
+                if not frames:
+                    return None
+                cob_id, data = frames.pop(0)
+                other.send(can.Message(arbitration_id=cob_id, data=data, is_extended_id=False))
+                return np.tile(motion.position, (20, 1))
+
+            motion.stream(source)
+    finally:
+        other.shutdown()
+    assert bench.powered() == {}
+
+
+def test_a_drive_behind_a_gear_is_refused(make_bench):
+    bench = make_bench(objects={TABLE: {(0x6091, 1): 50, (0x6091, 2): 1}})
+    with pytest.raises(NothingMovedError, match=r"0x6091 is 50/1"), bench.connected():
+        pass

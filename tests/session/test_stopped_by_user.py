@@ -1,0 +1,204 @@
+"""Ctrl-C at every stage: exit code 130, axes disabled, drives as they were, data kept."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from importlib import import_module
+
+import pytest
+import yaml
+
+from drives.canopen_drive import CanopenDrive, CanopenMotion
+from drives.canopen_drive.interrupts import uninterrupted
+from drives.errors import UserStopError
+from drives.sim.faults import Fault
+from fieldtool import workflow
+from fieldtool.records.recording import load
+
+TABLE, ARM = 11, 12
+CHECKING, SWEEPING = 3000, 12_000
+
+
+@dataclass(frozen=True)
+class Pressed(Fault):
+    """The user presses Ctrl-C at this moment."""
+
+    signal: int = signal.SIGINT
+
+    def set(self, machine, *, present):
+        signal.raise_signal(self.signal)
+
+
+def is_safe(bench):
+    assert bench.powered() == {}
+    assert bench.changed() == {}
+
+
+def test_while_connecting(bench, monkeypatch):
+    identify = CanopenDrive.identify
+
+    def pressing(drive):
+        signal.raise_signal(signal.SIGINT)
+        return identify(drive)
+
+    monkeypatch.setattr(CanopenDrive, "identify", pressing)
+    outcome = bench.run("--write", "--yes")
+    assert outcome.code == 130
+    assert "stopped by the user" in outcome.err
+    assert bench.machine.sync_count == 0, "nothing was enabled"
+    is_safe(bench)
+
+
+def test_while_enabling(bench, monkeypatch):
+    step = CanopenMotion._towards_enabled
+
+    def pressing(motion):
+        step(motion)
+        signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(CanopenMotion, "_towards_enabled", pressing)
+    assert bench.run().code == 130
+    assert bench.machine.sync_count < 100
+    is_safe(bench)
+
+
+@pytest.mark.parametrize("signal_number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("at", [CHECKING, SWEEPING])
+def test_while_axes_move(bench, at, signal_number):
+    bench.inject(Pressed(TABLE, signal_number), at)
+    outcome = bench.run("--write", "--yes")
+    assert outcome.code == 130, outcome.err
+    assert "Stopping all axes" in outcome.err
+    assert "stopped by the user" in outcome.err
+    assert bench.machine.sync_count < at + 600
+    is_safe(bench)
+    recording = bench.recording()
+    assert not recording.experiments[-1].complete
+    assert recording.experiments[-1].samples > 100
+    assert not (bench.out / "write-journal.yaml").exists()
+
+
+def test_a_second_and_third_time_does_not_cut_the_stop_short(bench):
+    for k in (0, 1, 2, 5, 20, 60):
+        bench.inject(Pressed(TABLE), SWEEPING + k)
+    outcome = bench.run()
+    assert outcome.code == 130
+    is_safe(bench)
+    assert not bench.recording().experiments[-1].complete
+
+
+def pressing_during(monkeypatch, module, name, only_call=1):
+    """Press Ctrl-C while this function of a module is at work."""
+    function, calls = getattr(module, name), []
+
+    def pressing(*arguments, **options):
+        calls.append(name)
+        if len(calls) == only_call:
+            signal.raise_signal(signal.SIGINT)
+        return function(*arguments, **options)
+
+    monkeypatch.setattr(module, name, pressing)
+
+
+@pytest.mark.usefixtures("quick_plan")
+@pytest.mark.parametrize("late", [False, True])
+@pytest.mark.parametrize(
+    ("module", "name", "call"),
+    [
+        ("measuring", "identify_recording", 1),
+        ("stages", "identify_recording", 1),
+        ("stages", "design", 1),
+        ("stages", "apply", 1),
+    ],
+)
+def test_between_measuring_and_writing(small_bench, monkeypatch, module, name, call, late):
+    """Neither in the mathematics nor right before the write is anything written any more.
+
+    ``late``: so long after the last motion that nothing polls; the work is broken off at once.
+    """
+    if late:
+        monkeypatch.setattr(import_module("fieldtool.cli.main"), "ASKED_WITHIN", -1.0)
+    target = import_module(f"fieldtool.workflow.{module}")
+    pressing_during(monkeypatch, target, name, call)
+    outcome = small_bench.run("--write", "--yes", "--store")
+    assert outcome.code == 130, outcome.err
+    is_safe(small_bench)
+    assert small_bench.stored() == {TABLE: {}}
+    assert small_bench.recording().experiments[-1].complete, "the data are kept"
+
+
+def test_a_script_that_asks_for_a_stop_gets_one(bench):
+    """The same from Python, without the command line's handler."""
+    with pytest.raises(UserStopError):
+        workflow.run(
+            bench.profile, bench.out, stop_requested=lambda: bench.machine.sync_count > SWEEPING
+        )
+    is_safe(bench)
+    assert not bench.recording().experiments[-1].complete
+
+
+def test_a_script_without_a_stop_function_is_safe_too(bench):
+    """Python's own KeyboardInterrupt in the middle of a cycle: axes off, data kept."""
+    bench.inject(Pressed(TABLE), SWEEPING)
+    with pytest.raises(UserStopError) as stop:
+        workflow.run(bench.profile, bench.out)
+    assert isinstance(stop.value.__cause__, KeyboardInterrupt)
+    is_safe(bench)
+    assert not bench.recording().experiments[-1].complete
+
+
+def test_fieldtool_run_in_a_process_of_its_own(tmp_path, profile_of_two):
+    profile = tmp_path / "machine.yaml"
+    profile_of_two["bus"]["channel"] = str(profile)
+    profile.write_text(yaml.safe_dump(profile_of_two))
+    out, log = tmp_path / "out", tmp_path / "log.txt"
+    with log.open("w") as output:
+        process = subprocess.Popen(
+            [sys.executable, "-u", "-m", "fieldtool", "run", str(profile), "--out", str(out)],
+            stdout=output,
+            stderr=subprocess.STDOUT,
+            env={**os.environ, "COLUMNS": "200"},
+        )
+        deadline = time.monotonic() + 60
+        while "sweep 1/5" not in log.read_text() and process.poll() is None:
+            assert time.monotonic() < deadline, log.read_text()
+            time.sleep(0.05)
+        process.send_signal(signal.SIGINT)
+        process.send_signal(signal.SIGINT)
+        assert process.wait(30) == 130, log.read_text()
+    text = log.read_text()
+    assert "stopped by the user" in text
+    assert "Traceback" not in text
+    assert not load(out / "recording.h5").experiments[-1].complete
+    assert '"UserStopError"' in (out / "events.jsonl").read_text()
+
+
+# --- the guard itself ----------------------------------------------------------------------------
+
+
+def press_under_guard(done):
+    with uninterrupted():
+        signal.raise_signal(signal.SIGINT)
+        done.append("all of it")
+
+
+def test_what_came_during_the_guard_acts_after_it():
+    done = []
+    with pytest.raises(KeyboardInterrupt):
+        press_under_guard(done)
+    assert done == ["all of it"]
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_an_error_on_its_way_is_not_replaced():
+    def fail_and_clean_up():
+        try:
+            raise UserStopError("first")
+        finally:
+            press_under_guard([])
+
+    with pytest.raises(UserStopError, match="first"):
+        fail_and_clean_up()
