@@ -37,6 +37,7 @@ from drives.units import unit_on
 FORMAT = "fieldtool-parameters/1"
 MAX_BACKUP_BYTES = 30_000_000
 """A drive has some thousand objects of 100 bytes here; a machine at most 32 drives."""
+_DUMPER: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 SAVE_SIGNATURE = int.from_bytes(b"save", "little")
 DISABLED_STATES = (PowerState.SWITCH_ON_DISABLED, PowerState.READY_TO_SWITCH_ON)
 COARSEST = 0.02
@@ -166,7 +167,7 @@ def save_backup(backup: Backup, path: Path) -> None:
     temporary = path.with_name(path.name + ".part")
     try:
         with temporary.open("w", encoding="utf-8") as file:
-            yaml.safe_dump(data, file, sort_keys=False, width=120)
+            yaml.dump(data, file, Dumper=_DUMPER, sort_keys=False, width=120)
             file.flush()
             os.fsync(file.fileno())
         if load_backup(temporary) != backup:

@@ -473,11 +473,12 @@ def read_yaml(path: Path, largest: int = MAX_PROFILE_BYTES) -> tuple[Any, Lines]
     lines: Lines = {}
     try:
         _refuse_aliases(text, path)
-        root = yaml.compose(text, Loader=_LOADER)
+        loader = _LOADER(text)
+        root = loader.get_single_node()
         if not isinstance(root, yaml.MappingNode):
             raise ProfileError(path, "is no mapping of keys to values", 1)
         _note_lines(root, (), lines, path)
-        return yaml.load(text, Loader=_LOADER), lines
+        return loader.construct_document(root), lines
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         raise ProfileError(

@@ -34,7 +34,14 @@ from drives.errors import (
 )
 from drives.parameters import Change
 from fieldtool import workflow
-from fieldtool.cli.screen import TerminalScreen, model_table, parameter_rows, show_result
+from fieldtool.cli.screen import (
+    WIDE,
+    TerminalScreen,
+    model_table,
+    parameter_rows,
+    show_parameters,
+    show_result,
+)
 from fieldtool.errors import (
     FieldtoolError,
     FileFormatError,
@@ -76,11 +83,13 @@ Out = Annotated[
     Path | None, typer.Option("--out", help="Session folder; a new one in sessions/ otherwise.")
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")]
-Yes = Annotated[bool, typer.Option("--yes", help="Do not ask before writing.")]
+Yes = Annotated[bool, typer.Option("--yes", help="Do not ask before moving and writing.")]
 Store = Annotated[
     bool, typer.Option("--store", help="Keep the new parameters in non-volatile memory too.")
 ]
-Plan = Annotated[str, typer.Option("--plan", help="How to measure: classic.")]
+Plan = Annotated[
+    str, typer.Option("--plan", help="How to measure: classic (stepped sines; axes float in turn).")
+]
 Motor = Annotated[
     str,
     typer.Option(
@@ -126,6 +135,7 @@ class _StoppableScreen:
     def __init__(self, screen: workflow.Screen, key: _StopKey) -> None:
         self._screen, self._key = screen, key
         self.say, self.plan, self.progress = screen.say, screen.plan, screen.progress
+        self.ready, self.found, self.designed = screen.ready, screen.found, screen.designed
 
     def stage(self, title: str) -> None:
         self._key.check()
@@ -168,7 +178,9 @@ def _options(plan: str, write: bool, store: bool, motor: str) -> workflow.Option
     )
 
 
-def _asker(console: Console, yes: bool, key: _StopKey) -> Callable[[Sequence[Change]], bool]:
+def _asker(
+    console: Console, yes: bool, key: _StopKey, store: bool
+) -> Callable[[Sequence[Change]], bool]:
     def ask(changes: Sequence[Change]) -> bool:
         key.check()
         if yes:
@@ -185,15 +197,23 @@ def _asker(console: Console, yes: bool, key: _StopKey) -> Callable[[Sequence[Cha
             for c in changes
         ]
         raw: Mapping[Any, Any] = {(c.axis, c.name): (c.before_raw, c.after_raw) for c in changes}
-        console.print(parameter_rows(rows, raw))
+        console.print(parameter_rows(rows, raw if console.width >= WIDE else None))
         if not sys.stdin.isatty():
             console.print(
                 "  Not written: there is nobody to ask. Use --yes to write without asking."
             )
             return False
-        return typer.confirm("Write these parameters into the drives?", err=True)
+        where = "working memory, and store them" if store else "working memory (not stored)"
+        return typer.confirm(f"Write these parameters into the drives' {where}?", err=True)
 
     return ask
+
+
+def _may_move(yes: bool) -> Callable[[str], bool] | None:
+    """Return how to ask a person before the machine moves; None where nobody has to be asked."""
+    if yes or not sys.stdin.isatty():
+        return None
+    return lambda sentence: typer.confirm(f"{sentence}\nMove the machine now?", err=True)
 
 
 def _print_json(data: Mapping[str, Any]) -> None:
@@ -204,23 +224,25 @@ def _print_json(data: Mapping[str, Any]) -> None:
 def run(
     machine: Machine,
     plan: Plan = "classic",
-    write: Annotated[bool, typer.Option("--write/--no-write")] = False,
+    write: Annotated[
+        bool, typer.Option("--write/--no-write", help="Write the new parameters into the drives.")
+    ] = False,
     yes: Yes = False,
     store: Store = False,
     motor_inertia: Motor = "measured",
     out: Out = None,
     as_json: Json = False,
 ) -> None:
-    """Measure, identify, design and, with --write, write back: all stages in order."""
+    """MOVES THE MACHINE. Measure, identify, design and, with --write, write back."""
     options = _options(plan, write, store, motor_inertia)
     console = _console(as_json)
-    with _stop_key() as key, TerminalScreen(console) as screen:
+    with _stop_key() as key, TerminalScreen(console, _may_move(yes)) as screen:
         result = workflow.run(
             machine,
             _folder(out, machine),
             options,
             screen=_StoppableScreen(screen, key),
-            confirm=_asker(console, yes, key),
+            confirm=_asker(console, yes, key, store),
             stop_requested=key,
         )
     show_result(console, result)
@@ -231,7 +253,9 @@ def run(
 @app.command()
 def demo(
     plan: Plan = "classic",
-    write: Annotated[bool, typer.Option("--write/--no-write")] = True,
+    write: Annotated[
+        bool, typer.Option("--write/--no-write", help="Write the new parameters into the drives.")
+    ] = True,
     store: Store = False,
     machine: Annotated[
         str, typer.Option("--machine", help="Another packaged simulated machine.")
@@ -245,13 +269,17 @@ def demo(
 
 @app.command()
 def measure(
-    machine: Machine, plan: Plan = "classic", out: Out = None, as_json: Json = False
+    machine: Machine,
+    plan: Plan = "classic",
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask before moving.")] = False,
+    out: Out = None,
+    as_json: Json = False,
 ) -> None:
-    """Measure only; the recording is in the session folder."""
+    """MOVES THE MACHINE. Measure only; the recording is in the session folder."""
     _options(plan, False, False, "measured")
     console = _console(as_json)
     folder = _folder(out, machine)
-    with _stop_key() as key, TerminalScreen(console) as screen:
+    with _stop_key() as key, TerminalScreen(console, _may_move(yes)) as screen:
         seconds = workflow.measure(
             machine, folder, screen=_StoppableScreen(screen, key), stop_requested=key
         )
@@ -289,8 +317,8 @@ def compare(
     model: Annotated[
         Path | None, typer.Option("--model", help="model.yaml; identified otherwise.")
     ] = None,
-    low: Annotated[float, typer.Option(help="Hz")] = 11.0,
-    high: Annotated[float, typer.Option(help="Hz")] = 200.0,
+    low: Annotated[float, typer.Option(help="Lowest frequency to compare, Hz.")] = 11.0,
+    high: Annotated[float, typer.Option(help="Highest frequency to compare, Hz.")] = 200.0,
     as_json: Json = False,
 ) -> None:
     """Predict a signal that no fit has seen (the load side), and print the error."""
@@ -325,8 +353,12 @@ def design(folder: Annotated[Path, typer.Argument(help="Session folder.")]) -> N
     console = _console(False)
     for axis in tuning.axes:
         console.print(
-            f"{axis.axis}: {axis.reason} Peak of sensitivity {axis.sensitivity_peak:.2f}."
+            f"{axis.axis}: {axis.reason} Peak of sensitivity {axis.sensitivity_peak:.2f} (2 or less is "
+            "good)."
         )
+        for name, value in axis.parameters.items():
+            console.print(f"  {name:22}{value:.6g}")
+    console.print(f"Kept in {folder}; `fieldtool write {folder}` brings it into the drives.")
 
 
 @app.command()
@@ -340,7 +372,8 @@ def write(
     options = workflow.Options(write=True, store=store)
     with _stop_key() as key, TerminalScreen(console) as screen:
         stoppable = _StoppableScreen(screen, key)
-        workflow.write(folder, options, _asker(console, yes, key), screen=stoppable)
+        result = workflow.write(folder, options, _asker(console, yes, key, store), screen=stoppable)
+    show_parameters(console, result)
 
 
 @app.command()
@@ -349,7 +382,9 @@ def restore(
     machine: Annotated[
         str | None, typer.Option("--machine", help="Machine profile; the session's otherwise.")
     ] = None,
-    store: Store = False,
+    store: Annotated[
+        bool, typer.Option("--store", help="Store the restored parameters too.")
+    ] = False,
 ) -> None:
     """Bring a backup of the drives' parameters back."""
     if machine is None:
@@ -434,7 +469,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         )
         report.write_text(traceback.format_exc(), encoding="utf-8")
         sys.stderr.write(
-            f"fieldtool: unexpected {type(error).__name__}: {error}. All axes were stopped. This is a "
-            f"defect of fieldtool; please report it with {report}\n"
+            f"fieldtool: unexpected {type(error).__name__}: {error}. If axes were moving, they were "
+            f"stopped. This is a defect of fieldtool; please report it with {report}\n"
         )
         sys.exit(1)

@@ -1,6 +1,6 @@
 """What a session looks like on a terminal: where it is, how long it will take, what it found."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from time import perf_counter
 from types import TracebackType
 from typing import Any
@@ -11,11 +11,13 @@ from rich.progress import Progress as Bar
 from rich.table import Table
 from rich.text import Text
 
+from fieldtool.design.tuning import Tuning
 from fieldtool.experiment.forecast import AxisForecast
 from fieldtool.experiment.plan import SweepPlan
 from fieldtool.experiment.runner import Progress
 from fieldtool.records.model import Estimate, Kind, MachineModel
-from fieldtool.workflow import SessionResult
+from fieldtool.workflow import SessionResult, parameter_table
+from fieldtool.writeback.transaction import WriteBack
 
 UNITS = {
     "rotary": {
@@ -29,24 +31,31 @@ UNITS = {
 }
 
 
+Ask = Callable[[str], bool]
+WIDE = 110
+"""Columns that the table with the drives' own units needs."""
+QUIET_INTERVAL = 5.0
+"""Seconds between progress lines where there is no terminal."""
+
+
 class _Left(ProgressColumn):
     """Time left, from the pace so far; it stays on the screen from the first tone on."""
 
     def render(self, task: Task) -> Text:
-        """Return e.g. ``about 1:20 left``."""
+        """Return e.g. ``1 min 20 s left``."""
         if task.finished:
             return Text(f"{_clock(task.elapsed or 0)} taken")
         if not task.completed or not task.elapsed:
-            return Text("time left: measuring the pace")
+            return Text("measuring the pace")
         left = task.elapsed * (1 - task.completed) / task.completed
-        return Text(f"about {_clock(left)} left")
+        return Text(f"{_clock(left)} left")
 
 
 class TerminalScreen:
     """Shows a session with ``rich``; a context manager, so that the terminal is left in order."""
 
-    def __init__(self, console: Console) -> None:
-        self.console = console
+    def __init__(self, console: Console, ask: Ask | None = None) -> None:
+        self.console, self._ask = console, ask
         self._bar: Bar | None = None
         self._task: Any = None
         self._last_shown = 0.0
@@ -110,10 +119,11 @@ class TerminalScreen:
         """Move the bar."""
         if self._bar is None:
             self._bar = Bar(
-                TextColumn("  {task.description}", markup=False),
-                BarColumn(bar_width=24),
+                TextColumn("  this pass"),
+                BarColumn(bar_width=20),
                 TextColumn("{task.percentage:>3.0f} %"),
                 _Left(),
+                TextColumn("{task.description}", markup=False),
                 console=self.console,
                 transient=True,
                 refresh_per_second=4,
@@ -125,16 +135,34 @@ class TerminalScreen:
             completed=progress.done,
             description=(
                 f"sweep {progress.sweep}/{progress.sweeps}: {progress.name}, "
-                f"{progress.frequency:.2f} Hz, ±{progress.amplitude:.2g}; "
-                f"machine time {_clock(progress.machine_time)}"
+                f"{progress.frequency:.2f} Hz"
             ),
         )
-        if not self.console.is_terminal and perf_counter() - self._last_shown > 10:
+        if not self.console.is_terminal and perf_counter() - self._last_shown > QUIET_INTERVAL:
             self._last_shown = perf_counter()
             task = self._bar.tasks[0]
             self.console.print(
-                Text(f"  {100 * progress.done:.0f} %, {task.description}, {_Left().render(task)}")
+                Text(f"  {100 * progress.done:.0f} %, {_Left().render(task)}; {task.description}")
             )
+
+    def ready(self) -> bool:
+        """Ask a person at the terminal; a script has decided by its call."""
+        if self._ask is None:
+            return True
+        return self._ask(
+            "The axes will move as shown. Is everybody out of the machine's reach, and a hand on the "
+            "emergency stop? Ctrl-C stops all axes."
+        )
+
+    def found(self, model: MachineModel, truth: MachineModel | None) -> None:
+        """Show the identified machine."""
+        self._close()
+        self.console.print(model_table(model, truth))
+
+    def designed(self, tuning: Tuning) -> None:
+        """Show why the new parameters are what they are."""
+        for axis in tuning.axes:
+            self.console.print(Text(f"  {axis.axis}: {axis.reason}"))
 
     def _close(self) -> None:
         if self._bar is not None:
@@ -154,7 +182,7 @@ def _column(table: Table, title: str, *, words: bool) -> None:
 
 def _clock(seconds: float) -> str:
     minutes, rest = divmod(round(seconds), 60)
-    return f"{minutes}:{rest:02d} min"
+    return f"{minutes} min {rest:02d} s" if minutes else f"{rest} s"
 
 
 def units_of(kind: Kind, torque_unit: str) -> dict[str, str]:
@@ -258,35 +286,26 @@ def _row(
     _add(table, *cells)
 
 
-def parameter_rows(rows: Sequence[Mapping[str, Any]], drive_units: Mapping[Any, Any]) -> Table:
-    """Return old and new parameters in physical and in drive units, and what was read back."""
+def parameter_rows(
+    rows: Sequence[Mapping[str, Any]], drive_units: Mapping[Any, Any] | None
+) -> Table:
+    """Return old and new parameters, in the drives' units too where given, and what was read back."""
     table = Table(box=None, padding=(0, 1))
-    for title in (
-        "axis",
-        "parameter",
-        "old",
-        "new",
-        "unit",
-        "old (drive)",
-        "new (drive)",
-        "read back",
-    ):
+    in_drive = () if drive_units is None else ("old (drive)", "new (drive)")
+    for title in ("axis", "parameter", "old", "new", "unit", *in_drive, "read back"):
         _column(table, title, words=title in ("axis", "parameter", "unit"))
     for row in rows:
-        raw = drive_units.get((row["axis"], row["name"]), ("", ""))
-        same = row["before"] == row["after"]
-        _add(
-            table,
+        cells = [
             row["axis"],
             row["name"],
             f"{row['before']:.6g}",
             f"{row['after']:.6g}",
             row["unit"] if row["unit"] != "1" else "",
-            _plain(raw[0]),
-            _plain(raw[1]),
-            "" if row["read_back"] is None else f"{row['read_back']:.6g}",
-            style="dim" if same else "",
-        )
+        ]
+        if drive_units is not None:
+            cells += [_plain(v) for v in drive_units.get((row["axis"], row["name"]), ("", ""))]
+        cells.append("" if row["read_back"] is None else f"{row['read_back']:.6g}")
+        _add(table, *cells, style="dim" if row["before"] == row["after"] else "")
     return table
 
 
@@ -295,21 +314,21 @@ def _plain(value: object) -> str:
 
 
 def show_result(console: Console, result: SessionResult) -> None:
-    """Show what a session found and did."""
-    console.print("\n[bold]The machine[/bold]")
-    console.print(model_table(result.model, result.truth))
+    """Show the parameters, and where everything is."""
     if result.write_back is not None:
         console.print("\n[bold]Controller parameters[/bold]")
-        from fieldtool.workflow import parameter_table
-
-        raw = {(c.axis, c.name): (c.before_raw, c.after_raw) for c in result.write_back.changes}
-        console.print(parameter_rows(parameter_table(result.write_back), raw))
-        for axis in result.tuning.axes:
-            console.print(Text(f"  {axis.axis}: {axis.reason}"))
-        console.print(Text(f"  {result.write_back.sentence}"))
+        show_parameters(console, result.write_back)
     console.print(
         Text(
             f"\nMachine time {_clock(result.machine_time)}, wall time {_clock(result.wall_time)}. "
-            f"Everything is in {result.folder}"
+            f"Everything is in {result.folder}; responses.png there shows measurement and model."
         )
     )
+
+
+def show_parameters(console: Console, write_back: WriteBack) -> None:
+    """Show old and new parameters, what was read back, and where the new ones are."""
+    raw = {(c.axis, c.name): (c.before_raw, c.after_raw) for c in write_back.changes}
+    wide = console.width >= WIDE
+    console.print(parameter_rows(parameter_table(write_back), raw if wide else None))
+    console.print(Text(f"  {write_back.sentence}"))

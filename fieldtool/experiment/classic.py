@@ -23,6 +23,8 @@ CYCLES_A_PERIOD = 10
 """At the highest frequency of the plan, at least."""
 SHARE_OF_LIMITS = 0.4
 """Of every limit that a tone may use at steady state, by the prior model."""
+REFERENCE_SHARE = 0.9
+"""Of the room to the travel's end that the reference may use; soft loops follow a part of it."""
 NEIGHBOURHOOD = 0.15
 """A tone's amplitude fits all frequencies so near, because the prior model is not exact."""
 GRID_RATIO = 1.06
@@ -141,6 +143,11 @@ def undamped_modes(model: MachineModel) -> tuple[FloatArray, list[FloatArray]]:
     return frequencies(every, rigid), locked
 
 
+def lowest_mode(model: MachineModel) -> float:
+    """Return the lowest resonance or antiresonance, Hz."""
+    return _mode_band(model)[0]
+
+
 def _mode_band(model: MachineModel) -> tuple[float, float]:
     """Return the lowest and the highest mode, Hz."""
     resonances, antiresonances = undamped_modes(model)
@@ -206,10 +213,11 @@ def _amplitudes(
     position, torque = setting.closed_loop(free).response(omega, driven)
     reference = np.zeros(position.shape[1])
     reference[driven] = 1.0
-    use = np.zeros(omega.size)
+    room = _room(setting, driven)
+    use = np.full(omega.size, SHARE_OF_LIMITS / (REFERENCE_SHARE * room))
     for k, (name, limits) in enumerate(zip(setting.model.names, setting.limits, strict=True)):
         x = np.abs(position[:, k])
-        room = min(setting.centre[k] - limits.travel[0], limits.travel[1] - setting.centre[k])
+        room = _room(setting, k)
         use = np.maximum.reduce(
             [
                 use,
@@ -223,6 +231,12 @@ def _amplitudes(
             use = np.maximum(use, np.abs(reference[k] - position[:, k]) / limits.following_error)
     worst: FloatArray = use.reshape(frequencies.size, near.size).max(axis=1)
     return SHARE_OF_LIMITS / worst
+
+
+def _room(setting: Setting, k: int) -> float:
+    """Return how far an axis may move from its centre, rad or m."""
+    low, high = setting.limits[k].travel
+    return float(min(setting.centre[k] - low, high - setting.centre[k]))
 
 
 def _notes(sweeps: list[Sweep]) -> tuple[str, ...]:

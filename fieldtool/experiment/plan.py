@@ -161,7 +161,9 @@ def transition(tone: Tone | None, before: Tone | None) -> FloatArray:
     return displacement
 
 
-def smooth_move(distance: float, velocity: float, acceleration: float, step: float) -> FloatArray:
+def smooth_move(
+    distance: float, velocity: float, acceleration: float, step: float, shortest: float = 0.0
+) -> FloatArray:
     """Return a rest-to-rest move as displacements, shape (n,), ending exactly at ``distance``.
 
     Minimum-jerk polynomial: peak velocity is 1.875 distance / T, peak acceleration
@@ -170,7 +172,9 @@ def smooth_move(distance: float, velocity: float, acceleration: float, step: flo
     if distance == 0:
         return np.zeros(1)
     size = abs(distance)
-    duration = max(1.875 * size / velocity, np.sqrt(5.774 * size / acceleration), 4 * step)
+    duration = max(
+        1.875 * size / velocity, np.sqrt(5.774 * size / acceleration), 4 * step, shortest
+    )
     n = int(np.ceil(duration / step))
     u = np.arange(1, n + 1) / n
     move: FloatArray = distance * u**3 * (10 - 15 * u + 6 * u * u)

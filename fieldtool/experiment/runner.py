@@ -45,6 +45,10 @@ CHECK_SLICE = 2
 CHECK_ASTRAY, CHECK_PUSHED = 1e-3, 10.0
 """Share of its travel that an axis may go the wrong way or drift in the check; an axis that does
 not move itself may be pushed by the factor more."""
+CHECK_ASTRAY_ERROR = 0.004
+"""Share of the following error limit that it may go astray in any case."""
+CHECK_TIME = 1.0
+"""Seconds that each of these moves takes at least, so that slow loops follow it."""
 CHECK_QUIET = 0.5
 """Share of what it may drift within which an axis counts as standing, before the check begins."""
 CHECK_STARTED = 0.02
@@ -98,6 +102,12 @@ class Axes:
     names: tuple[str, ...]
     limits: tuple[AxisLimits, ...]
     centre: FloatArray
+    units: tuple[str, ...] = ()
+    """Of positions, for messages."""
+
+    def unit(self, k: int) -> str:
+        """Return the unit of an axis' positions, for messages; empty where it was not given."""
+        return self.units[k] if self.units else ""
 
     @property
     def room(self) -> FloatArray:
@@ -182,6 +192,7 @@ class _DirectionCheck:
             CHECK_SHARE * limits.velocity,
             CHECK_SHARE * limits.acceleration,
             cycle_time,
+            CHECK_TIME,
         )
         self._rows = there.size
         rest, away = np.zeros(self._rest), np.full(self._rest, self._wanted)
@@ -190,7 +201,8 @@ class _DirectionCheck:
             self._path, self._wanted = CHECK_NUDGE * self._path, CHECK_NUDGE * self._wanted
         self._done = 0
         travel = np.array([one.travel[1] - one.travel[0] for one in axes.limits])
-        self._allowed = CHECK_ASTRAY * travel
+        errors = np.array([one.following_error for one in axes.limits])
+        self._allowed = np.maximum(CHECK_ASTRAY * travel, CHECK_ASTRAY_ERROR * errors)
         self._waiting = k > 0 or not nudge
         self._waited = self._still = 0
         self._still_rows = round(STILL_TIME / cycle_time)
@@ -219,43 +231,44 @@ class _DirectionCheck:
             if self._done > self._rest and j == self._k:
                 self._follow(name, float(moved[j]), allowed)
             else:
-                self._stay(name, float(moved[j]), allowed * (CHECK_PUSHED if pushed else 1.0))
+                most = allowed * (CHECK_PUSHED if pushed else 1.0)
+                self._stay(name, float(moved[j]), most, self._axes.unit(j))
         quiet = bool(np.all(np.abs(moved) < CHECK_QUIET * self._allowed))
         self._still = self._still + CHECK_SLICE if quiet else 0
         if self._still >= self._still_rows or self._waited >= self._longest_wait:
             self._waiting = False
 
     @staticmethod
-    def _stay(name: str, moved: float, allowed: float) -> None:
+    def _stay(name: str, moved: float, allowed: float, unit: str) -> None:
         if abs(moved) > allowed:
             raise SafetyStopError(
-                f"{name}: moved by {moved:.3g} while it was told to stand still; its power was cut "
-                "and all axes were stopped. Either the axis moves the wrong way (check the encoder's "
-                "direction and the motor's phases), or its loop is not stable, or it sags when its "
-                "brake opens.",
+                f"{name}: moved by {moved:.3g} {unit} while it was told to stand still; its power was "
+                "cut and all axes were stopped. Either the axis moves the wrong way (check the "
+                "encoder's direction and the motor's phases), or its loop is not stable, or it sags "
+                "when its brake opens.",
                 axis=name,
                 runaway=True,
             )
 
     def _follow(self, name: str, moved: float, allowed: float) -> None:
-        forward = moved * np.sign(self._wanted)
+        forward, unit = moved * np.sign(self._wanted), self._axes.unit(self._k)
         size = abs(self._wanted)
         comes_back = self._done > 2 * self._rest + self._rows
         astray = 0.5 * size if comes_back else allowed  # it may overshoot, there as well as back
         if forward < -astray or forward > 1.5 * size:
             raise SafetyStopError(
-                f"{name}: moves the wrong way or by itself: {self._wanted:.3g} was commanded, it moved "
-                f"{moved:.3g}; its power was cut and all axes were stopped. Check the encoder's "
-                "direction and the motor's phases.",
+                f"{name}: moves the wrong way or by itself: {self._wanted:.3g} {unit} was commanded, it "
+                f"moved {moved:.3g} {unit}; its power was cut and all axes were stopped. Check the "
+                "encoder's direction and the motor's phases.",
                 axis=name,
                 runaway=True,
             )
         half_way = self._rest + self._rows // 2 <= self._done < self._rest + self._rows
         if half_way and not self._nudge and forward < CHECK_STARTED * size:
             raise SafetyStopError(
-                f"{name}: does not follow: half of {self._wanted:.3g} was commanded, it moved "
-                f"{moved:.3g}; its power was cut and all axes were stopped. Is it blocked or its brake "
-                "closed, or does the encoder not count?",
+                f"{name}: does not follow: half of {self._wanted:.3g} {unit} was commanded, it moved "
+                f"{moved:.3g} {unit}; its power was cut and all axes were stopped. Is it blocked or "
+                "its brake closed, or does the encoder not count?",
                 axis=name,
                 runaway=True,
             )
@@ -265,18 +278,20 @@ class _DirectionCheck:
         name, wanted, k = self._axes.names[self._k], self._wanted, self._k
         position, torque = capture.position[self._waited :, k], capture.torque[self._waited :, k]
         moved = float(position[2 * self._rest + self._rows - 1] - position[0])
+        unit = self._axes.unit(k)
         if not 0.5 < moved / wanted < 1.5:
             raise SafetyStopError(
-                f"{name}: does not follow: {wanted:.3g} was commanded, it moved {moved:.3g}; all axes "
-                "were stopped. Is it blocked or its brake closed, or is the encoder's resolution "
-                "(0x608F) wrong?",
+                f"{name}: does not follow: {wanted:.3g} {unit} was commanded, it moved {moved:.3g} "
+                f"{unit}; all axes were stopped. Is it blocked or its brake closed, or is the "
+                "encoder's resolution (0x608F) wrong?",
                 axis=name,
             )
         # Whatever swings behind the motor, half way the whole axis has the momentum that the motor
         # gave.
         rest, half = self._rest, self._rows // 2
-        push = torque[rest : rest + half] - torque[:rest].mean()
-        if float(push.sum()) * wanted < 0:
+        push = float((torque[rest : rest + half] - torque[:rest].mean()).sum())
+        noise = float(torque[:rest].std()) * np.sqrt(half + half**2 / rest)
+        if push * np.sign(wanted) < -NOISE_FACTOR * noise:
             raise SafetyStopError(
                 f"{name}: the torque that starts a positive move is negative; all axes were stopped. "
                 "Check the drive's polarity (0x607E).",

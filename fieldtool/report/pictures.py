@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 
 from fieldtool.errors import OutputError
 from fieldtool.frf.matrix import OTHERS_FREE
@@ -68,6 +69,9 @@ def draw_responses(
         plot.set_title(f"{name}: motor acceleration per motor torque", loc="left", fontsize=10)
         plot.set_ylabel(unit)
         plot.grid(visible=True, which="both", alpha=0.25)
+    plots[-1].xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    plots[-1].xaxis.set_major_formatter(FormatStrFormatter("%g"))
+    plots[-1].xaxis.set_minor_formatter(NullFormatter())
     plots[0].legend(loc="upper left", fontsize=8, frameon=False)
     plots[-1].set_xlabel("frequency, Hz")
     try:

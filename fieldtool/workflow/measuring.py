@@ -5,10 +5,17 @@ from dataclasses import replace
 import numpy as np
 
 from drives.canopen_drive import CanopenGroup
+from drives.errors import UserStopError
 from drives.parameters import read_parameters
 from drives.profile import MachineProfile
 from fieldtool.errors import IdentificationError
-from fieldtool.experiment.classic import chosen_cycle_time, classic_plan, refined_plan
+from fieldtool.experiment.classic import (
+    chosen_cycle_time,
+    classic_plan,
+    lowest_mode,
+    refined_plan,
+    undamped_modes,
+)
 from fieldtool.experiment.forecast import Setting, forecast
 from fieldtool.experiment.runner import Axes, check_directions, run_plan
 from fieldtool.frf.held_targets import LINEAR_TARGETS
@@ -27,8 +34,8 @@ from fieldtool.workflow.models import prior_model
 from fieldtool.workflow.session import Session
 from fieldtool.writeback.transaction import take_backup
 
-SETTLE_GUESS = 8.0
-"""Seconds that a tone takes to settle, for the first estimate of a plan's duration."""
+SETTLE_PERIODS = 17.0
+"""Periods of the lowest mode that a tone takes to settle, for the estimate of a plan's duration."""
 
 
 def measured(session: Session, group: CanopenGroup) -> float:
@@ -46,10 +53,14 @@ def _measure_both_passes(session: Session, group: CanopenGroup) -> float:
     plan = classic_plan(setting, [axis.name for axis in machine.axes if axis.may_float], cycle_time)
     screen.stage("Plan the first pass")
     expected = forecast(plan, setting)
-    screen.plan(plan, expected, plan.expected_duration(SETTLE_GUESS))
+    guess = SETTLE_PERIODS / lowest_mode(setting.model)
+    screen.plan(plan, expected, plan.expected_duration(guess))
     for note in plan.notes:
         screen.say(note)
-    axes = Axes(group.axes, setting.limits, setting.centre)
+    if not session.ready():
+        raise UserStopError("not begun: nothing was moved")
+    units = tuple(drive.position_unit for drive in group.drives)
+    axes = Axes(group.axes, setting.limits, setting.centre, units)
     with RecordingWriter(folder.recording, _header(machine, group, cycle_time)) as recording:
 
         def keep(experiment: Experiment) -> None:
@@ -58,22 +69,32 @@ def _measure_both_passes(session: Session, group: CanopenGroup) -> float:
 
         screen.stage("Check that every axis moves the right way")
         check_directions(group, axes, cycle_time, keep)
-        screen.stage("Measure, first pass: an even grid over the band of the prior model")
+        screen.stage("Measure, pass 1 of 2: an even grid over the band of the prior model")
         machine_time = run_plan(group, plan, axes, keep, screen.progress)
+        screen.say(_measured_text(recording.recording))
         screen.stage("Find the modes, and plan the second pass around them")
         try:
             found = identify_recording(recording.recording, {}, setting.model, {})
         except IdentificationError as error:
             session.warn(f"The first pass alone can not be identified ({error})")
             return machine_time
+        modes = ", ".join(f"{w / (2 * np.pi):.2f}" for w in undamped_modes(found.model)[0])
+        screen.say(f"Resonances found: {modes} Hz." if modes else "The axes are rigid.")
         now_known = replace(setting, model=without_friction(found.model))
         second = refined_plan(now_known, found.damping_ratios, cycle_time)
         if not second.sweeps:
             return machine_time
-        screen.plan(second, forecast(second, now_known), second.expected_duration(SETTLE_GUESS))
-        screen.stage("Measure, second pass: at and beside every mode")
+        screen.plan(second, forecast(second, now_known), second.expected_duration(guess))
+        screen.stage("Measure, pass 2 of 2: at and beside every mode")
         machine_time += run_plan(group, second, axes, keep, screen.progress)
+        screen.say(_measured_text(recording.recording))
     return machine_time
+
+
+def _measured_text(recording: Recording) -> str:
+    segments = [s for e in recording.experiments for s in e.segments]
+    settled = sum(s.settled for s in segments)
+    return f"Measured so far: {len(segments)} tones, {settled} of them settled."
 
 
 def _setting(machine: MachineProfile, group: CanopenGroup, model: MachineModel) -> Setting:

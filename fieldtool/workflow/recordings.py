@@ -5,6 +5,7 @@ from pathlib import Path
 
 from drives.bus import open_bus
 from drives.profile import BusProfile, load_machine
+from fieldtool.errors import NotEnoughDataError
 from fieldtool.identify.prediction import LoadPrediction, predict_load
 from fieldtool.identify.recorded import identify_recording
 from fieldtool.records.csv_folder import read_folder, write_folder
@@ -52,6 +53,11 @@ def compare(
         Hz.
     """
     data = load(recording)
+    if len(data.axes) != 1:
+        raise NotEnoughDataError(
+            f"{recording}: the load side is predicted for recordings of a single axis; this one has "
+            f"{', '.join(data.names)}."
+        )
     machine = read_model(model) if model else identify_recording(data, {}).model
     return predict_load(machine, _delay_of(machine), data, band=band)
 

@@ -14,6 +14,7 @@ from drives.canopen_drive import CanopenGroup, connect
 from drives.parameters import Change, Written
 from drives.profile import MachineProfile, load_machine
 from fieldtool.design.tuning import Tuning
+from fieldtool.errors import OutputError
 from fieldtool.experiment.forecast import AxisForecast
 from fieldtool.experiment.plan import SweepPlan
 from fieldtool.experiment.runner import Progress
@@ -41,6 +42,15 @@ class Screen(Protocol):
     def progress(self, progress: Progress) -> None:
         """A block of a sweep ended."""
 
+    def ready(self) -> bool:
+        """Whether the machine may move now; asked once, after the first plan was shown."""
+
+    def found(self, model: MachineModel, truth: MachineModel | None) -> None:
+        """The machine was identified; the truth is known of simulated machines only."""
+
+    def designed(self, tuning: Tuning) -> None:
+        """New parameters were designed; nothing was written."""
+
 
 class Quiet:
     """A screen that shows nothing."""
@@ -55,6 +65,16 @@ class Quiet:
         """Show nothing."""
 
     def progress(self, progress: Progress) -> None:
+        """Show nothing."""
+
+    def ready(self) -> bool:
+        """Return True: who runs a session without a screen has decided."""
+        return True
+
+    def found(self, model: MachineModel, truth: MachineModel | None) -> None:
+        """Show nothing."""
+
+    def designed(self, tuning: Tuning) -> None:
         """Show nothing."""
 
 
@@ -106,6 +126,10 @@ class Session:
     screen: Screen
     warnings: list[str] = field(default_factory=list)
 
+    def ready(self) -> bool:
+        """Ask whether the machine may move."""
+        return self.screen.ready()
+
     def warn(self, sentence: str) -> None:
         """Show a sentence and keep it for the result; the same one only once."""
         if sentence not in self.warnings:
@@ -145,6 +169,11 @@ def open_session(
     profile = machine if isinstance(machine, MachineProfile) else load_machine(machine)
     folder = SessionFolder.create(out)
     if not keep_profile:
+        if folder.recording.exists():
+            raise OutputError(
+                f"{out}: already holds a session's recording, which is not overwritten. Choose another "
+                "folder with --out. Nothing was moved."
+            )
         write_yaml(folder.machine, yaml.safe_load(profile.path.read_text(encoding="utf-8")))
     session = Session(folder, profile, screen or Quiet())
     folder.note("session", machine=profile.name, version=version("fieldtool"))
@@ -157,7 +186,9 @@ def open_session(
             left_out = not_imitated(group.line.can_bus)
             if left_out:
                 session.warn(
-                    "This machine is simulated. Not imitated: " + "; ".join(left_out) + "."
+                    "SIMULATED machine: nothing real moves. What it does not imitate of a real bus: "
+                    + "; ".join(left_out)
+                    + "."
                 )
             yield session, group
     except BaseException as error:

@@ -71,9 +71,16 @@ def run(
     begin = time.perf_counter()
     with open_session(machine, out, screen, stop_requested) as (session, group):
         machine_time = measured(session, group)
+        if group.late_cycles:
+            session.warn(
+                f"{group.late_cycles} cycles began late on this computer; the blocks with them were "
+                "measured again. Close other programs, or use a longer cycle."
+            )
         identified = _identify(session, options)
+        session.screen.found(identified.model, truth_model(session.machine))
         session.screen.stage("Design new controller parameters")
         tuning = _design(session.folder, identified.model)
+        session.screen.designed(tuning)
         write_back = _write(session, group, tuning, options, confirm)
         session.warnings += group.warnings
     return SessionResult(
@@ -127,6 +134,9 @@ def identify(
     if folder and folder.machine.is_file():
         machine = load_machine(folder.machine)
         prior, motors = prior_model(machine), data_sheet_masses(machine, options)
+        lengths = {axis.name: len(axis.masses) for axis in prior.axes}
+        if any(lengths.get(name) != count for name, count in (masses or {}).items()):
+            prior = None  # of chains of another length
     identified = identify_recording(recording, masses or {}, prior, motors)
     if folder:
         _keep(folder, identified, prior)

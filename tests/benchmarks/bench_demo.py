@@ -23,7 +23,7 @@ from fieldtool.experiment.forecast import AxisForecast
 from fieldtool.experiment.plan import SweepPlan
 from fieldtool.experiment.runner import Progress
 from fieldtool.records.model import MachineModel
-from fieldtool.workflow import Options, SessionResult
+from fieldtool.workflow import Options, Quiet, SessionResult
 
 LIMITS = {"mass": 2.0, "spring": 2.0, "coupling": 5.0}
 """Per cent."""
@@ -31,7 +31,7 @@ CHANNEL = "bench-demo"
 
 
 @dataclass
-class Watch:
+class Watch(Quiet):
     """A screen that notes when it is told something."""
 
     told: list[tuple[float, str]] = field(default_factory=list)

@@ -52,6 +52,9 @@ PROCESS_VALUES = {
 }
 """Objects that a motion changes by what it is: targets, actual values, error history."""
 
+AFTER_CENTRING = 6000
+"""SYNCs from the start of the sweeps into the first one: the axes are centred and at rest first."""
+
 _numbers = itertools.count()
 
 
@@ -137,6 +140,7 @@ class Bench:
         profile: dict[str, Any],
         objects: dict[int, dict[tuple[int, int], Any]],
         capsys: pytest.CaptureFixture[str],
+        monkeypatch: pytest.MonkeyPatch,
         **drive_changes: Any,
     ) -> None:
         self.folder, self._capsys = folder, capsys
@@ -152,6 +156,35 @@ class Bench:
         self.machine: RunningMachine = register(self.channel, replace(described, drives=drives))
         self.before = self.objects()
         self._listener: can.BusABC | None = None
+        self.in_sweep: list[tuple[Fault, int]] = []
+        """Faults, and so many SYNCs after the middle of the first sweep they come."""
+        self._sweeps_began: int | None = None
+        self._watch_for_sweeps(monkeypatch)
+
+    def _watch_for_sweeps(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        from fieldtool.workflow import measuring
+
+        run_plan = measuring.run_plan
+
+        def noting(*arguments: Any) -> float:
+            if self._sweeps_began is None:
+                self._sweeps_began = self.machine.sync_count
+                for fault, after in self.in_sweep:
+                    self.machine.inject(fault, at_sync=self.mid_sweep + after)
+            return run_plan(*arguments)
+
+        monkeypatch.setattr(measuring, "run_plan", noting)
+
+    @property
+    def mid_sweep(self) -> int:
+        """Number of a SYNC in the middle of the first sweep, once the sweeps have begun."""
+        assert self._sweeps_began is not None, "it did not come as far as the first sweep"
+        return self._sweeps_began + AFTER_CENTRING
+
+    @property
+    def sweeps(self) -> bool:
+        """Whether the middle of the first sweep has come."""
+        return self._sweeps_began is not None and self.machine.sync_count >= self.mid_sweep
 
     def rewrite(self, profile: dict[str, Any]) -> None:
         self.data = profile
@@ -252,7 +285,9 @@ MakeBench = Callable[..., Bench]
 
 
 @pytest.fixture
-def make_bench(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Iterator[MakeBench]:
+def make_bench(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> Iterator[MakeBench]:
     """Make a bench of a profile (plain values); ``objects``: factory values by node and key."""
     benches: list[Bench] = []
 
@@ -261,7 +296,9 @@ def make_bench(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Iterator[M
         objects: dict[int, dict[tuple[int, int], Any]] | None = None,
         **drive_changes: Any,
     ) -> Bench:
-        bench = Bench(tmp_path, profile or two_axes(), objects or {}, capsys, **drive_changes)
+        bench = Bench(
+            tmp_path, profile or two_axes(), objects or {}, capsys, monkeypatch, **drive_changes
+        )
         benches.append(bench)
         return bench
 

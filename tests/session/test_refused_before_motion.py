@@ -492,7 +492,17 @@ def test_a_session_folder_below_a_file_is_refused(bench):
     nothing_was_done(bench)
 
 
-@pytest.mark.parametrize("name", ["recording.h5", "parameters-before.yaml.part", "machine.yaml"])
+def test_a_session_that_is_there_is_not_overwritten(bench):
+    bench.out.mkdir()
+    (bench.out / "recording.h5").write_text("measured yesterday")
+    outcome = bench.measure()
+    assert outcome.code == 3
+    assert "not overwritten" in outcome.err
+    assert (bench.out / "recording.h5").read_text() == "measured yesterday"
+    nothing_was_done(bench)
+
+
+@pytest.mark.parametrize("name", ["parameters-before.yaml.part", "machine.yaml"])
 def test_a_file_that_can_not_be_written_is_found_before_anything_moves(bench, name):
     (bench.out / name).mkdir(parents=True)
     outcome = bench.measure()

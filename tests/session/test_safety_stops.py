@@ -18,8 +18,6 @@ from drives.sim.faults import (
     PowerLoss,
 )
 
-SWEEPING = 12_000
-"""A SYNC in the middle of the first sweep of the two-axis bench (direction checks end at 7200)."""
 TABLE, ARM = 11, 12
 COUNTS = 2**20 / (2 * np.pi)
 QUICK_STOP, DISABLE = 0x02, 0x00
@@ -85,20 +83,25 @@ MID_SWEEP = [
     ("fault", "sentence", "advice", "within"), MID_SWEEP, ids=lambda v: str(v)[:24]
 )
 def test_trouble_in_a_sweep_stops_every_axis(bench, fault, sentence, advice, within):
-    bench.inject(fault, SWEEPING)
+    bench.in_sweep.append((fault, 0))
     bench.listen()
     outcome = bench.measure()
     assert outcome.code == 4, outcome.err
     assert sentence in outcome.err
     assert advice in outcome.err
     assert "all axes were stopped" in outcome.err
-    cycles = reaction(bench.heard(), SWEEPING)
+    frames = bench.heard()
+    cycles = reaction(frames, bench.mid_sweep)
     assert max(cycles.values()) <= within, cycles
     assert len(set(cycles.values())) == 1, f"both axes in the same cycle: {cycles}"
     if isinstance(fault, NodeVanishes):  # nobody can tell it: its heartbeat consumer does
         bench.machine.advance_to(bench.machine.time + 1_000_000_000)
         assert "could not be put back" in outcome.err
         assert "Switch the drive off and on" in outcome.err
+        other = {TABLE: ARM, ARM: TABLE}[fault.node_id]
+        assert not [f for f in frames if f.cob_id == 0x80 + other], (
+            "the host's heartbeat went on while the lost one was waited for"
+        )
     assert bench.powered() == {}
     recording = bench.recording()
     assert [e.complete for e in recording.experiments] == [True, True, False]
@@ -111,7 +114,7 @@ def test_trouble_in_a_sweep_stops_every_axis(bench, fault, sentence, advice, wit
 def test_a_drive_in_fault_state_without_emergency_stops_the_sweep(bench, monkeypatch):
     node = bench.machine.node(ARM)
     monkeypatch.setattr(node.emergency, "report", lambda *_: None)
-    bench.inject(DriveFault(ARM), SWEEPING)
+    bench.in_sweep.append((DriveFault(ARM), 0))
     outcome = bench.measure()
     assert outcome.code == 4
     assert "arm: the drive left operation enabled: statusword 0x" in outcome.err
@@ -119,12 +122,23 @@ def test_a_drive_in_fault_state_without_emergency_stops_the_sweep(bench, monkeyp
     assert bench.powered() == {}
 
 
-def test_the_reversed_motor_is_cut_off_in_mid_sweep_before_it_gets_fast(bench):
-    bench.inject(MotorReversed(TABLE), SWEEPING)
+@pytest.mark.parametrize("watches", [True, False])
+def test_a_motor_that_turns_around_in_mid_sweep_is_cut_off(make_bench, watches):
+    """Also where the drive itself does not watch its following error."""
+    bench = make_bench(objects={} if watches else {TABLE: {(0x6065, 0): 2**32 - 1}})
+    bench.in_sweep.append((MotorReversed(TABLE), 0))
     bench.listen()
     assert bench.measure().code == 4
-    speeds = _speeds(bench.heard(), TABLE, powered_only=True)
-    assert np.abs(speeds).max() < 10.0, "never above its velocity limit while it is powered"
+    frames = bench.heard()
+    stopped = bench.mid_sweep + reaction(frames, bench.mid_sweep)[TABLE]
+    rows = _inputs(frames, TABLE)
+    speeds = np.abs(_speeds(frames, TABLE))
+    at_stop = speeds[np.searchsorted(rows[1:, 0], stopped)]
+    assert at_stop < 10.5
+    assert speeds.max() < 1.6 * at_stop + 2.5, f"{speeds.max():.2f} after {at_stop:.2f} rad/s"
+    on = np.isin(rows[:, 1] & 0x6F, (0x27, 0x07)) | (rows[:, 1] & 0x4F == 0x0F)
+    powered = int(rows[on, 0].max()) - stopped
+    assert powered < 60, f"under power for {powered} cycles more"
 
 
 # --- the direction check -------------------------------------------------------------------------
@@ -201,7 +215,7 @@ def test_a_healthy_axis_near_the_end_of_its_travel_is_checked_inwards(bench):
         way = np.concatenate([way, np.full(200, way[-1])])
         motion.stream(_once(np.stack([way, 0 * way], axis=1)))
     bench.listen()
-    bench.inject(NodeVanishes(ARM), bench.machine.sync_count + SWEEPING)
+    bench.in_sweep.append((NodeVanishes(ARM), 0))
     assert "sent no PDO" in bench.measure().err
     rows = _inputs(bench.heard(), TABLE)
     assert rows[:, 2].max() / COUNTS < np.deg2rad(120)
@@ -422,7 +436,7 @@ def test_a_bus_that_dies_in_motion_is_no_refusal_before_motion(bench, monkeypatc
     import can
 
     def unplugged(self, message, timeout=None):
-        if bench.machine.sync_count >= SWEEPING:
+        if bench.sweeps:
             raise can.CanOperationError("adapter is gone")
         send(self, message, timeout)
 
@@ -449,7 +463,7 @@ def test_a_full_disk_does_not_hide_why_the_machine_was_stopped(bench, monkeypatc
         append(self, experiment)
 
     monkeypatch.setattr(RecordingWriter, "append", full)
-    bench.inject(EmergencyOnly(ARM), SWEEPING)
+    bench.in_sweep.append((EmergencyOnly(ARM), 0))
     outcome = bench.measure()
     assert outcome.code == 4
     assert "0x4210" in outcome.err
@@ -460,8 +474,8 @@ def test_a_full_disk_does_not_hide_why_the_machine_was_stopped(bench, monkeypatc
 def test_a_drive_that_refuses_to_be_put_back_is_named(bench):
     from drives.sim.faults import SdoRefused
 
-    bench.inject(EmergencyOnly(ARM), SWEEPING)
-    bench.inject(SdoRefused(ARM, 0x6007, 0, 0x08000022), SWEEPING)
+    bench.in_sweep.append((EmergencyOnly(ARM), 0))
+    bench.in_sweep.append((SdoRefused(ARM, 0x6007, 0, 0x08000022), 0))
     outcome = bench.measure()
     assert outcome.code == 4
     assert "could not be put back: arm, object 0x6007:00" in outcome.err

@@ -426,7 +426,7 @@ def reversed_torque(_r: np.ndarray, _p: np.ndarray, torque: np.ndarray) -> None:
     ("fault", "axis", "words"),
     [
         (reversed_axis, "y", "y: moves the wrong way"),
-        (blocked_axis, "y", "y: does not follow: half of 0.08 was commanded, it moved 0"),
+        (blocked_axis, "y", "y: does not follow: half of 0.08 "),
         (too_fine_encoder, "y", "y: (does not follow|moved by|moves)"),
         (reversed_torque, "x", "x: the torque that starts a positive move is negative"),
     ],
