@@ -36,7 +36,7 @@ class Look(Fault):
 
 
 class LatePdo:
-    """Holds one TPDO of the table back until its cycle is over."""
+    """Holds one TPDO of the arm, the last to answer, back until its cycle is over."""
 
     def __init__(self, monkeypatch, late_count):
         self.held, self.count, self.late_count = None, 0, late_count
@@ -49,7 +49,7 @@ class LatePdo:
             message, self.held = self.held, None
             return message
         message = self.recv(bus, timeout)
-        if message is not None and message.arbitration_id == 0x180 + TABLE:
+        if message is not None and message.arbitration_id == 0x180 + ARM:
             self.count += 1
             if self.count == self.late_count:
                 self.held = message
@@ -64,14 +64,14 @@ def test_a_late_pdo_is_never_taken_for_the_next_cycles(bench, monkeypatch):
     bench.listen()
     with bench.connected() as group, group.motion(0.002) as motion:
         first = bench.machine.sync_count + 1
-        capture = motion.stream(once(slow_ramp()))
+        capture = motion.stream(once(slow_ramp()[:, ::-1]))
     monkeypatch.undo()
     (late, *disturbed) = capture.missing
     assert all(row == late + 1 for row in disturbed)
     sent = {
-        f.sync: struct.unpack("<Hih", f.data)[1] for f in bench.heard() if f.cob_id == 0x180 + TABLE
+        f.sync: struct.unpack("<Hih", f.data)[1] for f in bench.heard() if f.cob_id == 0x180 + ARM
     }
-    counts = np.rint(capture.position[:, 0] * COUNTS).astype(int)
+    counts = np.rint(capture.position[:, 1] * COUNTS).astype(int)
     fresh = [row for row in range(capture.rows) if row not in capture.missing]
     assert len(fresh) >= capture.rows - 2
     assert [counts[row] for row in fresh] == [sent[first + row] for row in fresh]
