@@ -36,6 +36,16 @@ class ResponseMatrix:
                     f"{what} must have shape {(size, axes, axes)} "
                     f"(frequencies, axes, axes), got {array.shape}"
                 )
+        seen = np.any(self.measured, axis=0)
+        for k, name in enumerate(self.names):
+            if not (seen[k].any() or seen[:, k].any()):
+                raise NotEnoughDataError(f"axis {name}: no frequency response was measured")
+            there = self.measured[:, k, k]
+            if there.any() and not np.any(self.response[there, k, k]):
+                raise NotEnoughDataError(
+                    f"axis {name}: its position does not answer its torque at any frequency: nothing "
+                    "moved. Is the axis blocked, or is the column of its position the right one?"
+                )
         if np.any(~(self.std[self.measured] > 0.0)):
             f, i, j = np.argwhere(self.measured & ~(self.std > 0.0))[0]
             raise ValueError(
@@ -43,10 +53,6 @@ class ResponseMatrix:
                 f"{self.omega[f] / (2 * np.pi):.6g} Hz is {self.std[f, i, j]:.3g}, it must be "
                 "positive; measure more periods, or give an estimate of the noise"
             )
-        seen = np.any(self.measured, axis=0)
-        for k, name in enumerate(self.names):
-            if not (seen[k].any() or seen[:, k].any()):
-                raise NotEnoughDataError(f"axis {name}: no frequency response was measured")
 
     @property
     def measured(self) -> NDArray[np.bool_]:

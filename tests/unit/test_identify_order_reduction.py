@@ -165,7 +165,9 @@ def test_standard_errors_agree_with_repeated_noise(rng):
         model = exact_modes.random_machine(rng, 2, [2, 3])
         axes, cross = bench.machine_inputs(model, spectra(model))
         closest = min(
-            float(np.min(np.diff(np.sort([*s.resonances[1:], *s.antiresonances])) / s.resonances[-1]))
+            float(
+                np.min(np.diff(np.sort([*s.resonances[1:], *s.antiresonances])) / s.resonances[-1])
+            )
             for s in (axis.spectrum for axis in axes)
         )
     noisy = []
