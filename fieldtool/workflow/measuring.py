@@ -9,6 +9,7 @@ from drives.errors import UserStopError
 from drives.parameters import read_parameters
 from drives.profile import MachineProfile
 from fieldtool.errors import IdentificationError
+from fieldtool.experiment.axes import Axes
 from fieldtool.experiment.classic import (
     chosen_cycle_time,
     classic_plan,
@@ -16,8 +17,9 @@ from fieldtool.experiment.classic import (
     refined_plan,
     undamped_modes,
 )
+from fieldtool.experiment.directions import check_directions
 from fieldtool.experiment.forecast import Setting, forecast
-from fieldtool.experiment.runner import Axes, check_directions, run_plan
+from fieldtool.experiment.runner import run_plan
 from fieldtool.frf.held_targets import LINEAR_TARGETS
 from fieldtool.identify.classic import without_friction
 from fieldtool.identify.recorded import identify_recording

@@ -174,7 +174,7 @@ def open_session(
                 f"{out}: already holds a session's recording, which is not overwritten. Choose another "
                 "folder with --out. Nothing was moved."
             )
-        write_yaml(folder.machine, yaml.safe_load(profile.path.read_text(encoding="utf-8")))
+        write_yaml(folder.machine, _resolved(profile))
     session = Session(folder, profile, screen or Quiet())
     folder.note("session", machine=profile.name, version=version("fieldtool"))
     session.screen.stage(f"Connect to {profile.name}")
@@ -191,10 +191,22 @@ def open_session(
                     + "."
                 )
             yield session, group
+            for text in group.warnings:
+                session.warn(text)
     except BaseException as error:
         folder.note("ended", error=type(error).__name__, text=str(error))
         raise
     folder.note("ended")
+
+
+def _resolved(profile: MachineProfile) -> dict[str, Any]:
+    """Return the profile as its file has it, with drive profiles found from the folder too."""
+    data: dict[str, Any] = yaml.safe_load(profile.path.read_text(encoding="utf-8"))
+    for axis in data["axes"]:
+        beside = profile.path.parent / str(axis["drive"])
+        if beside.is_file():
+            axis["drive"] = str(beside.resolve())
+    return data
 
 
 def parameter_table(write_back: WriteBack | None) -> list[dict[str, Any]]:

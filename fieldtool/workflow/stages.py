@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from drives.canopen_drive import CanopenGroup, connect
+from drives.errors import UserStopError
 from drives.parameters import Change, HeldObject, load_backup
 from drives.profile import MachineProfile, load_machine
 from fieldtool.design.tuning import Tuning, design
@@ -81,8 +82,11 @@ def run(
         session.screen.stage("Design new controller parameters")
         tuning = _design(session.folder, identified.model)
         session.screen.designed(tuning)
+        if stop_requested():
+            raise UserStopError(
+                "stopped by the user before anything was written; no axis was moving"
+            )
         write_back = _write(session, group, tuning, options, confirm)
-        session.warnings += group.warnings
     return SessionResult(
         session.folder.path,
         identified.model,

@@ -17,10 +17,11 @@ from drives.sim.faults import DriveFault, NodeVanishes, NoTransmitPdos, SdoRefus
 from drives.sim.lockstep_bus import register, unregister
 from drives.sim.machine import simulated_machine
 from fieldtool.errors import FieldtoolError
-from fieldtool.experiment import runner
+from fieldtool.experiment import directions
+from fieldtool.experiment.axes import Axes
 from fieldtool.experiment.classic import chosen_cycle_time, classic_plan
+from fieldtool.experiment.directions import check_directions
 from fieldtool.experiment.forecast import forecast
-from fieldtool.experiment.runner import Axes, check_directions
 from fieldtool.workflow.measuring import _setting
 from fieldtool.workflow.models import prior_model
 
@@ -392,7 +393,7 @@ def test_any_limit_leads_to_a_clean_refusal_or_a_clean_start(
 ):
     """Never a traceback, never a drive left on, never a drive changed."""
     travel, middle, velocity, acceleration, torque, error = values
-    monkeypatch.setattr(runner, "LONGEST_MOVE", 5.0)
+    monkeypatch.setattr(directions, "LONGEST_MOVE", 5.0)
     half = 10.0**travel
     profile = deepcopy(profile_of_two)
     profile["axes"][0]["limits"] = {

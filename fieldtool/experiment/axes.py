@@ -1,0 +1,108 @@
+"""What experiments know of axes: names, limits, centres; bringing them to rest; keeping raw data."""
+
+from collections.abc import Callable, Iterable
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from drives.api import AxisLimits, Capture, FloatArray, Motion
+from fieldtool.errors import FieldtoolError
+from fieldtool.experiment.plan import smooth_move
+from fieldtool.records.recording import Experiment
+
+MOVE_SHARE = 0.25
+"""Share of the velocity and acceleration limits that positioning moves use."""
+STILL, STILL_TIME, STILL_TIMEOUT = 1e-4, 0.5, 20.0
+"""An axis stands that moves less than this share of its travel in so many seconds; waited for at
+most the last, seconds."""
+Keep = Callable[[Experiment], None]
+"""Gets an experiment's raw data as soon as it has ended, also when it was cut short."""
+
+
+class Mover(Protocol):
+    """Gives enabled axes: ``CanopenGroup`` does."""
+
+    def motion(
+        self, cycle_time: float, free: tuple[str, ...] = ()
+    ) -> AbstractContextManager[Motion]:
+        """Enable all axes; those in ``free`` float."""
+
+
+@dataclass(frozen=True)
+class Axes:
+    """What the runner has to know of the axes."""
+
+    names: tuple[str, ...]
+    limits: tuple[AxisLimits, ...]
+    centre: FloatArray
+    units: tuple[str, ...] = ()
+    """Of positions, for messages."""
+
+    def unit(self, k: int) -> str:
+        """Return the unit of an axis' positions, for messages; empty where it was not given."""
+        return self.units[k] if self.units else ""
+
+    @property
+    def room(self) -> FloatArray:
+        """From the centre to the nearer end of the travel, shape (M,)."""
+        return np.array(
+            [
+                min(c - limits.travel[0], limits.travel[1] - c)
+                for c, limits in zip(self.centre, self.limits, strict=True)
+            ]
+        )
+
+
+def bring_to_centre(motion: Motion, axes: Axes) -> None:
+    """Bring every axis to its centre, all at the same time, and wait until nothing swings."""
+    start = motion.position
+    paths = [
+        positioning_move(axes, k, float(axes.centre[k] - start[k]), motion.cycle_time)
+        for k in range(len(axes.names))
+    ]
+    n = max(path.size for path in paths)
+    way = np.empty((n, len(paths)))
+    for k, path in enumerate(paths):
+        way[:, k] = start[k] + np.concatenate([path, np.full(n - path.size, path[-1])])
+    hold = np.tile(way[-1], (max(2, round(STILL_TIME / motion.cycle_time)), 1))
+    travel = np.array([limits.travel[1] - limits.travel[0] for limits in axes.limits])
+    held = 0
+
+    def source(before: Capture | None) -> FloatArray | None:
+        nonlocal held
+        if before is None:
+            return way
+        moved = np.ptp(before.position, axis=0)
+        if held and (np.all(moved < STILL * travel) or held * STILL_TIME > STILL_TIMEOUT):
+            return None
+        held += 1
+        return hold
+
+    motion.stream(source)
+
+
+def positioning_move(axes: Axes, k: int, distance: float, step: float) -> FloatArray:
+    """Return an axis' rest-to-rest move at MOVE_SHARE of its limits, as displacements."""
+    limits = axes.limits[k]
+    return smooth_move(
+        distance, MOVE_SHARE * limits.velocity, MOVE_SHARE * limits.acceleration, step
+    )
+
+
+def sample_times(rows: int, step: float) -> FloatArray:
+    """Return the times of so many SYNCs from 0, shape (rows,), s."""
+    times: FloatArray = np.arange(rows, dtype=np.float64) * step
+    return times
+
+
+def keep_whatever_happens(
+    experiments: Iterable[Experiment], keep: Keep, cause: BaseException
+) -> None:
+    """Keep what was recorded before an error; that error counts, not one of the disk."""
+    try:
+        for experiment in experiments:
+            keep(experiment)
+    except FieldtoolError as error:
+        cause.add_note(f"what was recorded last could not be kept: {error}")

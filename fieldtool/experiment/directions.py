@@ -1,0 +1,251 @@
+"""See that every axis goes the right way, by a small move and back."""
+
+import numpy as np
+
+from drives.api import Capture, FloatArray, Motion
+from drives.errors import SafetyStopError, StoppedError
+from fieldtool.errors import PlanRefusedError
+from fieldtool.experiment.axes import (
+    MOVE_SHARE,
+    STILL_TIME,
+    STILL_TIMEOUT,
+    Axes,
+    Keep,
+    Mover,
+    keep_whatever_happens,
+    sample_times,
+)
+from fieldtool.experiment.plan import smooth_move
+from fieldtool.records.recording import Experiment
+
+CHECK_REST = 0.3
+"""Seconds of rest before, between and after these moves."""
+CHECK_SHARE = 0.05
+"""Share of the velocity and acceleration limits that these moves use."""
+CHECK_MOVE = 0.02
+"""Share of the travel by which each axis moves when its direction is checked."""
+CHECK_NUDGE = 0.1
+"""Share of that move by which each axis is nudged first."""
+CHECK_SLICE = 2
+"""Cycles after which the check looks at what the axes did."""
+CHECK_ASTRAY, CHECK_PUSHED = 1e-3, 10.0
+"""Share of its travel that an axis may go the wrong way or drift in the check; an axis that does
+not move itself may be pushed by the factor more."""
+CHECK_ASTRAY_ERROR = 0.004
+"""Share of the following error limit that it may go astray in any case."""
+CHECK_TIME = 1.0
+"""Seconds that each of these moves takes at least, so that slow loops follow it."""
+CHECK_QUIET = 0.5
+"""Share of what it may drift within which an axis counts as standing, before the check begins."""
+CHECK_STARTED = 0.02
+"""Share of the check's move that an axis must have done when half of it was commanded."""
+LONGEST_MOVE = 600.0
+"""Seconds that crossing the travel may take at most."""
+PUSH_FACTOR = 4.0
+"""Standard errors beyond which the sign of a torque counts."""
+
+
+def check_directions(group: Mover, axes: Axes, cycle_time: float, keep: Keep) -> None:
+    """Move every axis a little and back, where it stands, and see that it goes the right way.
+
+    Each axis moves towards its centre, at first by a nudge only.  It is judged every few cycles, long
+    before its following error leaves the limit: a loop of the wrong sign runs away from the smallest
+    push, its own or another axis', and the nudges find that while it is slow.
+
+    Raises
+    ------
+    PlanRefusedError
+        If the limits make positioning so slow that it would take too long; nothing moves.
+    SafetyStopError
+        If an axis does not follow, or moves the wrong way or by itself, or its torque has the
+        wrong sign.
+    """
+    _check_pace(axes)
+    experiments: list[Experiment] = []
+    try:
+        with group.motion(cycle_time) as motion:
+            start = motion.position
+            for k in range(len(axes.names)):
+                nudge = _DirectionCheck(axes, k, start, cycle_time, nudge=True)
+                _stream_check(motion, nudge, axes.names[k], experiments.append)
+            experiments.clear()  # of the nudges only one that was cut short is worth keeping
+            for k in range(len(axes.names)):
+                check = _DirectionCheck(axes, k, start, cycle_time)
+                capture = _stream_check(motion, check, axes.names[k], experiments.append)
+                check.judge(capture)
+    except BaseException as error:
+        keep_whatever_happens(experiments, keep, error)
+        raise
+    for experiment in experiments:  # the disk may be slow: not while axes wait for their SYNC
+        keep(experiment)
+
+
+def _check_pace(axes: Axes) -> None:
+    for name, limits in zip(axes.names, axes.limits, strict=True):
+        way = limits.travel[1] - limits.travel[0]
+        velocity, acceleration = limits.velocity, limits.acceleration
+        duration = max(
+            1.875 * way / (MOVE_SHARE * velocity),
+            1.875 * CHECK_MOVE * way / (CHECK_SHARE * velocity),
+            np.sqrt(5.774 * way / (MOVE_SHARE * acceleration)),
+        )
+        if not duration <= LONGEST_MOVE:
+            raise PlanRefusedError(
+                f"{name}: with a velocity limit of {velocity:g}/s and an acceleration limit of "
+                f"{acceleration:g}/s2, moving across the travel {limits.travel[0]:g} to "
+                f"{limits.travel[1]:g} takes {duration:.3g} s, at most {LONGEST_MOVE:g} s are "
+                "allowed. Nothing was moved. Correct the limits in the machine profile."
+            )
+
+
+class _DirectionCheck:
+    """One axis' small move, in slices of a few cycles that are judged as they come.
+
+    It begins when nothing swings any more from the check of the axis before.
+    """
+
+    def __init__(
+        self, axes: Axes, k: int, start: FloatArray, cycle_time: float, nudge: bool = False
+    ) -> None:
+        self._axes, self._k, self._start, self._nudge = axes, k, start, nudge
+        limits = axes.limits[k]
+        size = CHECK_MOVE * (limits.travel[1] - limits.travel[0])
+        self._wanted = float(np.copysign(size, axes.centre[k] - start[k]))
+        self._rest = max(2, round(CHECK_REST / cycle_time))
+        there = smooth_move(
+            self._wanted,
+            CHECK_SHARE * limits.velocity,
+            CHECK_SHARE * limits.acceleration,
+            cycle_time,
+            CHECK_TIME,
+        )
+        self._rows = there.size
+        rest, away = np.zeros(self._rest), np.full(self._rest, self._wanted)
+        self._path = np.concatenate([rest, there, away, self._wanted - there, rest])
+        if nudge:
+            self._path, self._wanted = CHECK_NUDGE * self._path, CHECK_NUDGE * self._wanted
+        self._done = 0
+        travel = np.array([one.travel[1] - one.travel[0] for one in axes.limits])
+        errors = np.array([one.following_error for one in axes.limits])
+        self._allowed = np.maximum(CHECK_ASTRAY * travel, CHECK_ASTRAY_ERROR * errors)
+        self._waiting = k > 0 or not nudge
+        self._waited = self._still = 0
+        self._still_rows = round(STILL_TIME / cycle_time)
+        self._longest_wait = round(STILL_TIMEOUT / cycle_time)
+
+    def __call__(self, before: Capture | None) -> FloatArray | None:
+        """Return the next slice of targets; see ``drives.api.Source``."""
+        if before is not None:
+            self._watch(before)
+        if self._waiting:
+            self._waited += CHECK_SLICE
+            return np.tile(self._start, (CHECK_SLICE, 1))
+        if self._done >= self._path.size:
+            return None
+        part = self._path[self._done : self._done + CHECK_SLICE]
+        self._done += part.size
+        targets = np.tile(self._start, (part.size, 1))
+        targets[:, self._k] += part
+        return targets
+
+    def _watch(self, capture: Capture) -> None:
+        moved = capture.position[-1] - self._start
+        pushed = not self._nudge and (self._waiting or self._done > self._rest)
+        for j, name in enumerate(self._axes.names):
+            allowed = float(self._allowed[j])
+            if self._done > self._rest and j == self._k:
+                self._follow(name, float(moved[j]), allowed)
+            else:
+                most = allowed * (CHECK_PUSHED if pushed else 1.0)
+                self._stay(name, float(moved[j]), most, self._axes.unit(j))
+        quiet = bool(np.all(np.abs(moved) < CHECK_QUIET * self._allowed))
+        self._still = self._still + CHECK_SLICE if quiet else 0
+        if self._still >= self._still_rows or self._waited >= self._longest_wait:
+            self._waiting = False
+
+    @staticmethod
+    def _stay(name: str, moved: float, allowed: float, unit: str) -> None:
+        if abs(moved) > allowed:
+            raise SafetyStopError(
+                f"{name}: moved by {moved:.3g} {unit} while it was told to stand still; its power was "
+                "cut and all axes were stopped. Either the axis moves the wrong way (check the "
+                "encoder's direction and the motor's phases), or its loop is not stable, or it sags "
+                "when its brake opens.",
+                axis=name,
+                runaway=True,
+            )
+
+    def _follow(self, name: str, moved: float, allowed: float) -> None:
+        forward, unit = moved * np.sign(self._wanted), self._axes.unit(self._k)
+        size = abs(self._wanted)
+        comes_back = self._done > 2 * self._rest + self._rows
+        astray = 0.5 * size if comes_back else allowed  # it may overshoot, there as well as back
+        if forward < -astray or forward > 1.5 * size:
+            raise SafetyStopError(
+                f"{name}: moves the wrong way or by itself: {self._wanted:.3g} {unit} was commanded, it "
+                f"moved {moved:.3g} {unit}; its power was cut and all axes were stopped. Check the "
+                "encoder's direction and the motor's phases.",
+                axis=name,
+                runaway=True,
+            )
+        half_way = self._rest + self._rows // 2 <= self._done < self._rest + self._rows
+        if half_way and not self._nudge and forward < CHECK_STARTED * size:
+            raise SafetyStopError(
+                f"{name}: does not follow: half of {self._wanted:.3g} {unit} was commanded, it moved "
+                f"{moved:.3g} {unit}; its power was cut and all axes were stopped. Is it blocked or "
+                "its brake closed, or does the encoder not count?",
+                axis=name,
+                runaway=True,
+            )
+
+    def judge(self, capture: Capture) -> None:
+        """Raise SafetyStopError if the whole move was not what was commanded."""
+        name, wanted, k = self._axes.names[self._k], self._wanted, self._k
+        position, torque = capture.position[self._waited :, k], capture.torque[self._waited :, k]
+        moved = float(position[2 * self._rest + self._rows - 1] - position[0])
+        unit = self._axes.unit(k)
+        if not 0.5 < moved / wanted < 1.5:
+            raise SafetyStopError(
+                f"{name}: does not follow: {wanted:.3g} {unit} was commanded, it moved {moved:.3g} "
+                f"{unit}; all axes were stopped. Is it blocked or its brake closed, or is the "
+                "encoder's resolution (0x608F) wrong?",
+                axis=name,
+            )
+        # Whatever swings behind the motor, half way the whole axis has the momentum that the motor
+        # gave.
+        rest, half = self._rest, self._rows // 2
+        push = float((torque[rest : rest + half] - torque[:rest].mean()).sum())
+        noise = float(torque[:rest].std()) * np.sqrt(half + half**2 / rest)
+        if push * np.sign(wanted) < -PUSH_FACTOR * noise:
+            raise SafetyStopError(
+                f"{name}: the torque that starts a positive move is negative; all axes were stopped. "
+                "Check the drive's polarity (0x607E).",
+                axis=name,
+            )
+
+
+def _stream_check(motion: Motion, check: _DirectionCheck, driven: str, keep: Keep) -> Capture:
+    def experiment(capture: Capture, note: str = "") -> Experiment:
+        return Experiment(
+            name=f"direction check of {driven}",
+            kind="moves",
+            driven=(driven,),
+            free=(),
+            period=None,
+            time=sample_times(capture.rows, motion.cycle_time),
+            position=capture.position,
+            torque=capture.torque,
+            position_reference=capture.position_reference,
+            statusword=capture.statusword,
+            complete=not note,
+            note=note,
+        )
+
+    try:
+        capture = motion.stream(check)
+    except StoppedError as error:
+        if isinstance(error.capture, Capture) and error.capture.rows > 1:
+            keep(experiment(error.capture, str(error)))
+        raise
+    keep(experiment(capture))
+    return capture
