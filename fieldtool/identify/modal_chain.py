@@ -21,8 +21,9 @@ from fieldtool.identify.spectrum import Spectrum
 from fieldtool.records.model import Estimate, Kind
 
 FloatArray = NDArray[np.float64]
-SEEN = 5.0
-"""Standard errors that a mode's largest component must have to count as seen."""
+SEEN = 10.0
+"""Standard errors that a mode's largest component must have to count as seen; modes that a fit invents
+out of noise reach 7."""
 
 
 @dataclass(frozen=True, eq=False)

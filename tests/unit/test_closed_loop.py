@@ -148,6 +148,17 @@ def test_time_steps_are_those_of_lsim(
         None if one is None else replace(one, inertia_ff=0.0) for one in closed.loops
     )  # lsim can not have the impulses of a bent reference's acceleration
     closed = ClosedLoop(closed.model, loops)
+    growth = float(np.linalg.eigvals(closed.system_matrix()).real.max()) * n * step
+    if growth > 3.0:  # rounding grows along: two ways of stepping can not agree in its digits
+        closed = ClosedLoop(
+            closed.model,
+            tuple(
+                None
+                if one is None
+                else replace(one, velocity_p=0.02 * one.velocity_p, velocity_i=0.0, filters=())
+                for one in loops
+            ),
+        )
     references = np.zeros((n, m))
     references[:, -1] = np.interp(np.arange(n), np.arange(0, n, 40), fresh_rng.normal(size=10))
     references[0] = 0.0
