@@ -35,10 +35,9 @@ from drives.errors import (
 from drives.parameters import Change
 from fieldtool import workflow
 from fieldtool.cli.screen import (
-    WIDE,
     TerminalScreen,
     model_table,
-    parameter_rows,
+    parameter_table_of,
     show_parameters,
     show_result,
 )
@@ -49,6 +48,7 @@ from fieldtool.errors import (
     OutputError,
     PlanRefusedError,
 )
+from fieldtool.writeback.transaction import WriteBack
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -185,19 +185,8 @@ def _asker(
         key.check()
         if yes:
             return True
-        rows = [
-            {
-                "axis": c.axis,
-                "name": c.name,
-                "unit": c.unit,
-                "before": c.before,
-                "after": c.after,
-                "read_back": None,
-            }
-            for c in changes
-        ]
-        raw: Mapping[Any, Any] = {(c.axis, c.name): (c.before_raw, c.after_raw) for c in changes}
-        console.print(parameter_rows(rows, raw if console.width >= WIDE else None))
+        planned = WriteBack((), tuple(changes), in_memory=False, stored=False, backup=None)
+        console.print(parameter_table_of(planned, console.width))
         if not sys.stdin.isatty():
             console.print(
                 "  Not written: there is nobody to ask. Use --yes to write without asking."

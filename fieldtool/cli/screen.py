@@ -328,7 +328,11 @@ def show_result(console: Console, result: SessionResult) -> None:
 
 def show_parameters(console: Console, write_back: WriteBack) -> None:
     """Show old and new parameters, what was read back, and where the new ones are."""
-    raw = {(c.axis, c.name): (c.before_raw, c.after_raw) for c in write_back.changes}
-    wide = console.width >= WIDE
-    console.print(parameter_rows(parameter_table(write_back), raw if wide else None))
+    console.print(parameter_table_of(write_back, console.width))
     console.print(Text(f"  {write_back.sentence}"))
+
+
+def parameter_table_of(write_back: WriteBack, width: int) -> Table:
+    """Return old and new parameters, in the drives' own units too where the terminal is wide enough."""
+    raw = {(c.axis, c.name): (c.before_raw, c.after_raw) for c in write_back.changes}
+    return parameter_rows(parameter_table(write_back), raw if width >= WIDE else None)
