@@ -2,7 +2,8 @@
 
 Layout of the file (HDF5, format ``fieldtool-frequency-response/1``): group ``responses`` with one
 group ``0000``, ... per response: attributes ``name``, ``condition``, ``axes``; datasets
-``frequencies`` (F,), ``response`` (F, M, M) as pairs r, i, and ``std`` (F, M, M).
+``frequencies`` (F,), ``response`` (F, M, M) as pairs r, i, ``std`` (F, M, M), and, where errors of
+the elements go together, ``covariance`` (F, M*M, M*M) as pairs r, i.
 """
 
 from collections.abc import Mapping
@@ -34,6 +35,10 @@ class FrequencyResponse:
     """(F, M, M): standard error of the real part, and of the imaginary part."""
     condition: str
     """What the axes that were not driven did: ``others free``, ``others locked``, ..."""
+    covariance: ComplexArray | None = None
+    """(F, M*M, M*M): E[e e^H] of the errors of the elements, row after row (element i, j at
+    i * M + j), Hermitian; None where the errors of elements are independent.  NaN rows and columns
+    where an element was not measured."""
 
     def __post_init__(self) -> None:
         F, M = self.frequencies.size, len(self.axes)
@@ -52,6 +57,19 @@ class FrequencyResponse:
             raise ValueError("response and std must be NaN at the same places")
         if np.any(self.std < 0):
             raise ValueError("std must not be negative")
+        if self.covariance is not None:
+            self._check_covariance(self.covariance)
+
+    def _check_covariance(self, covariance: ComplexArray) -> None:
+        F, M = self.frequencies.size, len(self.axes)
+        if covariance.shape != (F, M * M, M * M):
+            raise ValueError(
+                f"covariance must have shape {(F, M * M, M * M)}, got {covariance.shape}"
+            )
+        variance = np.einsum("fkk->fk", covariance).real.reshape(F, M, M)
+        there = self.measured
+        if not np.allclose(variance[there], self.complex_std[there] ** 2, rtol=1e-6, atol=0.0):
+            raise ValueError("the diagonal of covariance must be twice the square of std")
 
     @property
     def measured(self) -> NDArray[np.bool_]:
@@ -101,6 +119,8 @@ def save_responses(responses: Mapping[str, FrequencyResponse], path: Path | str)
             put(group, "frequencies", response.frequencies)
             put(group, "response", response.response)
             put(group, "std", response.std)
+            if response.covariance is not None:
+                put(group, "covariance", response.covariance)
         file.write(path)
     finally:
         file.close()
@@ -131,5 +151,6 @@ def _read(reader: Reader) -> tuple[str, FrequencyResponse]:
         response=reader.array("response", np.complex128, 3),
         std=reader.array("std", np.float64, 3),
         condition=reader.text("condition"),
+        covariance=reader.optional_array("covariance", np.complex128, 3),
     )
     return reader.text("name"), response

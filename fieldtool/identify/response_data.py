@@ -1,6 +1,7 @@
 """Measured frequency responses, as the fits take them."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,6 +10,8 @@ from fieldtool.errors import NotEnoughDataError
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
+LOAD = 1e-12
+"""Added to the diagonal of correlations, so that elements that are one and the same do no harm."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,6 +28,9 @@ class ResponseMatrix:
     std: FloatArray
     """Standard error of the complex value, shape (F, M, M), unit of G: the square root of the
     mean of |error|**2, shared evenly by real and imaginary part; NaN where not measured."""
+    covariance: ComplexArray | None = None
+    """Of the errors of the elements, row after row, shape (F, M*M, M*M): E[e e^H]; None where they
+    are independent.  With it every line has all its elements or none."""
 
     def __post_init__(self) -> None:
         size, axes = self.omega.size, len(self.names)
@@ -36,6 +42,8 @@ class ResponseMatrix:
                     f"{what} must have shape {(size, axes, axes)} "
                     f"(frequencies, axes, axes), got {array.shape}"
                 )
+        if self.covariance is not None:
+            self._check_covariance(self.covariance)
         seen = np.any(self.measured, axis=0)
         for k, name in enumerate(self.names):
             if not (seen[k].any() or seen[:, k].any()):
@@ -71,7 +79,7 @@ class ResponseMatrix:
         return 2 * int(np.count_nonzero(self.measured))
 
     def residuals(self, model: ComplexArray, floor: float = 0.0) -> FloatArray:
-        """Model minus measurement in units of standard errors, real parts then imaginary parts.
+        """Model minus measurement, whitened: uncorrelated, standard error 1; real then imaginary.
 
         Parameters
         ----------
@@ -80,18 +88,71 @@ class ResponseMatrix:
         floor : float
             Relative error added to the noise, to start a fit gently (:meth:`errors`).
         """
-        difference = (model - self.response)[self.measured] * self.weights(floor)
-        return np.concatenate([difference.real, difference.imag])
+        difference = model - self.response
+        if self.covariance is None:
+            white = difference[self.measured] * self.weights(floor)
+        else:
+            lines, whiten = self._lines, self._whitening(floor)
+            flat = difference[lines].reshape(lines.size, -1)
+            white = np.einsum("fab,fb->fa", whiten, flat).ravel()
+        return np.concatenate([white.real, white.imag])
 
     def jacobian(self, derivatives: ComplexArray, floor: float = 0.0) -> FloatArray:
         """Derivatives of :meth:`residuals` from those of G, shape (F, M, M, P)."""
-        weighted = derivatives[self.measured] * self.weights(floor)[:, None]
+        if self.covariance is None:
+            weighted = derivatives[self.measured] * self.weights(floor)[:, None]
+        else:
+            lines, whiten = self._lines, self._whitening(floor)
+            count = derivatives.shape[-1]
+            flat = derivatives[lines].reshape(lines.size, -1, count)
+            weighted = np.matmul(whiten, flat).reshape(-1, count)
         return np.concatenate([weighted.real, weighted.imag])
 
     def weights(self, floor: float = 0.0) -> FloatArray:
         """Inverse standard errors of the parts of each measured value, shape (measured,)."""
         weights: FloatArray = np.sqrt(2.0) / self.errors(floor)[self.measured]
         return weights
+
+    @cached_property
+    def _lines(self) -> NDArray[np.intp]:
+        """Lines with values."""
+        return np.flatnonzero(self.measured[:, 0, 0])
+
+    def _whitening(self, floor: float) -> ComplexArray:
+        """Matrices W with W C W^H = 2, so that parts have variance 1, shape (lines, M*M, M*M)."""
+        kept: dict[float, ComplexArray] = self._whitenings
+        if floor not in kept:
+            kept[floor] = self._whitened(floor)
+        return kept[floor]
+
+    @cached_property
+    def _whitenings(self) -> dict[float, ComplexArray]:
+        return {}
+
+    def _whitened(self, floor: float) -> ComplexArray:
+        if self.covariance is None:
+            raise ValueError("errors are independent: there is nothing to whiten")
+        covariance = self.covariance[self._lines]
+        size = covariance.shape[1]
+        std = np.sqrt(np.einsum("fkk->fk", covariance).real)
+        if floor:
+            added = self.errors(floor)[self._lines].reshape(-1, size) ** 2 - std**2
+            covariance = covariance + np.eye(size) * added[:, :, None]
+            std = np.sqrt(np.einsum("fkk->fk", covariance).real)
+        scaled = covariance / (std[:, :, None] * std[:, None, :])
+        lower = np.linalg.cholesky(scaled + LOAD * np.eye(size))
+        inverse: ComplexArray = np.linalg.inv(lower)
+        result: ComplexArray = np.sqrt(2.0) * inverse / std[:, None, :]
+        return result
+
+    def _check_covariance(self, covariance: ComplexArray) -> None:
+        size, axes = self.omega.size, len(self.names)
+        shape = (size, axes * axes, axes * axes)
+        if covariance.shape != shape:
+            raise ValueError(f"covariance must have shape {shape}, got {covariance.shape}")
+        counted = np.count_nonzero(self.measured.reshape(size, -1), axis=1)
+        if np.any((counted != 0) & (counted != axes * axes)):
+            raise ValueError("with a covariance a line must have all its elements or none")
 
     def errors(self, floor: float) -> FloatArray:
         """Standard errors with `floor` times the size of the response added, shape (F, M, M).
