@@ -90,7 +90,7 @@ class ResponseMatrix:
         """
         difference = model - self.response
         if self.covariance is None:
-            white = difference[self.measured] * self.weights(floor)
+            white: ComplexArray = difference[self.measured] * self.weights(floor)
         else:
             lines, whiten = self._lines, self._whitening(floor)
             flat = difference[lines].reshape(lines.size, -1)
@@ -100,7 +100,7 @@ class ResponseMatrix:
     def jacobian(self, derivatives: ComplexArray, floor: float = 0.0) -> FloatArray:
         """Derivatives of :meth:`residuals` from those of G, shape (F, M, M, P)."""
         if self.covariance is None:
-            weighted = derivatives[self.measured] * self.weights(floor)[:, None]
+            weighted: ComplexArray = derivatives[self.measured] * self.weights(floor)[:, None]
         else:
             lines, whiten = self._lines, self._whitening(floor)
             count = derivatives.shape[-1]
@@ -141,7 +141,7 @@ class ResponseMatrix:
             std = np.sqrt(np.einsum("fkk->fk", covariance).real)
         scaled = covariance / (std[:, :, None] * std[:, None, :])
         lower = np.linalg.cholesky(scaled + LOAD * np.eye(size))
-        inverse: ComplexArray = np.linalg.inv(lower)
+        inverse = np.linalg.inv(lower).astype(np.complex128)
         result: ComplexArray = np.sqrt(2.0) * inverse / std[:, None, :]
         return result
 
