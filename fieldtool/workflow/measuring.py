@@ -6,10 +6,7 @@ import numpy as np
 
 from drives.canopen_drive import CanopenGroup
 from drives.errors import UserStopError
-from drives.parameters import read_parameters
-from drives.profile import MachineProfile
 from fieldtool.errors import IdentificationError
-from fieldtool.experiment.axes import Axes
 from fieldtool.experiment.classic import (
     chosen_cycle_time,
     classic_plan,
@@ -18,21 +15,13 @@ from fieldtool.experiment.classic import (
     undamped_modes,
 )
 from fieldtool.experiment.directions import check_directions
-from fieldtool.experiment.forecast import Setting, forecast
+from fieldtool.experiment.forecast import forecast
 from fieldtool.experiment.runner import run_plan
-from fieldtool.frf.held_targets import LINEAR_TARGETS
 from fieldtool.identify.classic import without_friction
 from fieldtool.identify.recorded import identify_recording
-from fieldtool.records.closed_loop import loop_from_parameters
-from fieldtool.records.model import MachineModel
-from fieldtool.records.recording import (
-    AxisInfo,
-    Controller,
-    Experiment,
-    Recording,
-    RecordingWriter,
-)
+from fieldtool.records.recording import Experiment, Recording, RecordingWriter
 from fieldtool.workflow.models import prior_model
+from fieldtool.workflow.preparation import axes_of, recording_header, setting_of
 from fieldtool.workflow.session import Session
 from fieldtool.writeback.transaction import take_backup
 
@@ -50,7 +39,7 @@ def measured(session: Session, group: CanopenGroup) -> float:
 
 def _measure_both_passes(session: Session, group: CanopenGroup) -> float:
     machine, screen, folder = session.machine, session.screen, session.folder
-    setting = _setting(machine, group, prior_model(machine))
+    setting = setting_of(machine, group, prior_model(machine))
     cycle_time = chosen_cycle_time(setting.model, group.shortest_cycle)
     plan = classic_plan(setting, [axis.name for axis in machine.axes if axis.may_float], cycle_time)
     screen.stage("Plan the first pass")
@@ -61,9 +50,10 @@ def _measure_both_passes(session: Session, group: CanopenGroup) -> float:
         screen.say(note)
     if not session.ready():
         raise UserStopError("not begun: nothing was moved")
-    units = tuple(drive.position_unit for drive in group.drives)
-    axes = Axes(group.axes, setting.limits, setting.centre, units)
-    with RecordingWriter(folder.recording, _header(machine, group, cycle_time)) as recording:
+    axes = axes_of(group, setting)
+    with RecordingWriter(
+        folder.recording, recording_header(machine, group, cycle_time)
+    ) as recording:
 
         def keep(experiment: Experiment) -> None:
             recording.append(experiment)
@@ -97,46 +87,3 @@ def _measured_text(recording: Recording) -> str:
     segments = [s for e in recording.experiments for s in e.segments]
     settled = sum(s.settled for s in segments)
     return f"Measured so far: {len(segments)} tones, {settled} of them settled."
-
-
-def _setting(machine: MachineProfile, group: CanopenGroup, model: MachineModel) -> Setting:
-    return Setting(
-        model,
-        tuple(loop_from_parameters(read_parameters(drive)) for drive in group.drives),
-        tuple(drive.limits for drive in group.drives),
-        np.array([sum(axis.limits.travel) / 2 for axis in machine.axes]),
-    )
-
-
-def _header(machine: MachineProfile, group: CanopenGroup, cycle_time: float) -> Recording:
-    axes = []
-    for axis, drive in zip(machine.axes, group.drives, strict=True):
-        values = read_parameters(drive)
-        rotary = axis.kind == "rotary"
-        axes.append(
-            AxisInfo(
-                name=axis.name,
-                kind=axis.kind,
-                masses=len(axis.prior.masses),
-                motor_inertia=axis.motor_inertia.value if axis.motor_inertia else None,
-                rated_torque=drive.rated_torque,
-                encoder_counts_per_rev=(2 * np.pi / drive.scaling.position if rotary else None),
-                controller=Controller(
-                    values["position_p"],
-                    values["velocity_p"],
-                    values["velocity_i"],
-                    axis.limits.torque,
-                ),
-                torque_unit="N m" if rotary else "N",
-                position_unit="rad" if rotary else "m",
-            )
-        )
-    source = {"machine": machine.name}
-    linear = [
-        f"{d.axis}={d.profile.torque_lag!r}"
-        for d in group.drives
-        if d.profile.interpolation == "linear"
-    ]
-    if linear:
-        source[LINEAR_TARGETS] = " ".join(linear)
-    return Recording(cycle_time, tuple(axes), (), machine.description, source)

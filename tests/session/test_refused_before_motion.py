@@ -22,7 +22,7 @@ from fieldtool.experiment.axes import Axes
 from fieldtool.experiment.classic import chosen_cycle_time, classic_plan
 from fieldtool.experiment.directions import check_directions
 from fieldtool.experiment.forecast import forecast
-from fieldtool.workflow.measuring import _setting
+from fieldtool.workflow.preparation import setting_of
 from fieldtool.workflow.models import prior_model
 
 TABLE, ARM = 11, 12
@@ -412,7 +412,7 @@ def test_any_limit_leads_to_a_clean_refusal_or_a_clean_start(
         begun = False
         try:
             with connect(machine) as group, group.without_feed_forward():
-                setting = _setting(machine, group, prior_model(machine))
+                setting = setting_of(machine, group, prior_model(machine))
                 cycle = chosen_cycle_time(setting.model, group.shortest_cycle)
                 forecast(classic_plan(setting, group.axes, cycle), setting)
                 begun = True

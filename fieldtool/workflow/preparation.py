@@ -1,0 +1,64 @@
+"""What every measurement begins with: what planning has to know, and the recording's heading."""
+
+import numpy as np
+
+from drives.canopen_drive import CanopenGroup
+from drives.parameters import read_parameters
+from drives.profile import MachineProfile
+from fieldtool.experiment.axes import Axes
+from fieldtool.experiment.forecast import Setting
+from fieldtool.frf.held_targets import LINEAR_TARGETS
+from fieldtool.records.closed_loop import loop_from_parameters
+from fieldtool.records.model import MachineModel
+from fieldtool.records.recording import AxisInfo, Controller, Recording
+
+
+def setting_of(machine: MachineProfile, group: CanopenGroup, model: MachineModel) -> Setting:
+    """Return model, loops as they are in the drives now, limits, and centres."""
+    return Setting(
+        model,
+        tuple(loop_from_parameters(read_parameters(drive)) for drive in group.drives),
+        tuple(drive.limits for drive in group.drives),
+        np.array([sum(axis.limits.travel) / 2 for axis in machine.axes]),
+    )
+
+
+def recording_header(machine: MachineProfile, group: CanopenGroup, cycle_time: float) -> Recording:
+    """Return a recording without experiments, with all that is known of the axes."""
+    axes = []
+    for axis, drive in zip(machine.axes, group.drives, strict=True):
+        values = read_parameters(drive)
+        rotary = axis.kind == "rotary"
+        axes.append(
+            AxisInfo(
+                name=axis.name,
+                kind=axis.kind,
+                masses=len(axis.prior.masses),
+                motor_inertia=axis.motor_inertia.value if axis.motor_inertia else None,
+                rated_torque=drive.rated_torque,
+                encoder_counts_per_rev=(2 * np.pi / drive.scaling.position if rotary else None),
+                controller=Controller(
+                    values["position_p"],
+                    values["velocity_p"],
+                    values["velocity_i"],
+                    axis.limits.torque,
+                ),
+                torque_unit="N m" if rotary else "N",
+                position_unit="rad" if rotary else "m",
+            )
+        )
+    source = {"machine": machine.name}
+    linear = [
+        f"{d.axis}={d.profile.torque_lag!r}"
+        for d in group.drives
+        if d.profile.interpolation == "linear"
+    ]
+    if linear:
+        source[LINEAR_TARGETS] = " ".join(linear)
+    return Recording(cycle_time, tuple(axes), (), machine.description, source)
+
+
+def axes_of(group: CanopenGroup, setting: Setting) -> Axes:
+    """Return what the runners have to know of the axes."""
+    units = tuple(drive.position_unit for drive in group.drives)
+    return Axes(group.axes, setting.limits, setting.centre, units)
