@@ -50,6 +50,10 @@ class Capture:
     """Object 0x6041 at each SYNC, shape (n, M)."""
     missing: tuple[int, ...] = ()
     """Rows in which a drive's PDO did not come; they repeat the row before."""
+    torque_offset: FloatArray | None = None
+    """Torque offset that took effect at each SYNC and was held until the next one, as sent: rounded
+    to the drive's units, shape (n, M), N m or N.  It acts after the SYNC, and torque and position of
+    the same row are sampled before: they show it from the next row on.  None if none was streamed."""
 
     @property
     def rows(self) -> int:
@@ -73,12 +77,46 @@ def joined(captures: Sequence[Capture]) -> Capture:
         np.concatenate([c.torque for c in captures]),
         np.concatenate([c.statusword for c in captures]),
         tuple(missing),
+        _joined_offsets(captures),
     )
 
 
-Source = Callable[[Capture | None], FloatArray | None]
+def _joined_offsets(captures: Sequence[Capture]) -> FloatArray | None:
+    """Return all offsets; a capture without any had offsets of 0, if another one has some."""
+    if all(c.torque_offset is None for c in captures):
+        return None
+    return np.concatenate(
+        [np.zeros_like(c.torque) if c.torque_offset is None else c.torque_offset for c in captures]
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Targets:
+    """A block of targets with a torque added to what the drives' own loops ask for.
+
+    Raises
+    ------
+    ValueError
+        If the two have different shapes.
+    """
+
+    position: FloatArray
+    """Target positions, shape (n, M), rad or m."""
+    torque_offset: FloatArray
+    """Torque offsets, shape (n, M), N m or N; 0 for axes whose drive has none."""
+
+    def __post_init__(self) -> None:
+        if self.position.ndim != 2 or self.position.shape != self.torque_offset.shape:
+            raise ValueError(
+                "targets need positions and torque offsets of one shape (n, M), got "
+                f"{self.position.shape} and {self.torque_offset.shape}"
+            )
+
+
+Source = Callable[[Capture | None], FloatArray | Targets | None]
 """Gives the next block of targets, shape (n, M), rad or m, seeing what the block before did (None
-at the start); None ends the stream.  Columns of floating axes are not used."""
+at the start); None ends the stream.  Columns of floating axes are not used.  A block may be
+``Targets`` in a motion that streams torque offsets; a plain array has offsets of 0."""
 
 
 class Drive(Protocol):
@@ -114,6 +152,9 @@ class Motion(Protocol):
 
     def stream(self, source: Source) -> Capture:
         """Follow targets SYNC by SYNC and return what all axes did.
+
+        Torque offsets end with the stream: where the last one was not 0, one more cycle, which is
+        in no capture, holds the last positions with offsets of 0.
 
         Raises
         ------

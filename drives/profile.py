@@ -129,6 +129,9 @@ class DriveProfile(_Part):
     """How the drive goes from one cyclic target to the next."""
     torque_lag: Annotated[float, BeforeValidator(_time), Field(ge=0)] = 0.0
     """From the drive's reference to the torque that it reports: current loop and inner sampling."""
+    torque_offset: bool = False
+    """Whether the drive adds 0x60B2 to its torque reference in cyclic position mode, at every SYNC,
+    so that torques may be streamed together with positions."""
     interpolation_index: Literal[-6, -5, -4, -3] = -3
     """Exponent of ten that 0x60C2:2 gets."""
     volatile_commands: tuple[Address, ...] = ()
@@ -261,6 +264,19 @@ class BusProfile(_Part):
     bitrate: Annotated[int, Field(ge=10_000, le=1_000_000)] = 1_000_000
 
 
+class CoulombFrictionProfile(_Part):
+    """Dry friction between a chain's first (motor) or last (load) mass and ground."""
+
+    effect: Literal["coulomb_friction"]
+    location: Literal["motor", "load"] = "motor"
+    torque: NotNegative
+    """N m, or N on a linear axis; the same at standstill as while sliding."""
+
+
+EffectProfile = CoulombFrictionProfile
+"""One part of a simulated axis; a union of such classes, told apart by ``effect``."""
+
+
 class SimulatedAxisProfile(_Part):
     """The truth about one axis of a simulated machine, SI."""
 
@@ -268,6 +284,8 @@ class SimulatedAxisProfile(_Part):
     springs: tuple[Positive, ...] = ()
     dampers: tuple[NotNegative, ...] = ()
     viscous_friction: NotNegative = 0.0
+    effects: tuple[Annotated[EffectProfile, Field(discriminator="effect")], ...] = ()
+    """What makes the axis non-linear, with the names of ``model.yaml``."""
     rated_torque: Positive
     peak_torque: Positive
     torque_noise: NotNegative = 0.0
@@ -409,7 +427,7 @@ def _load(path: Path, model: type[P]) -> P:
     except ValidationError as error:
         errors = error.errors()  # a misspelled key also shows as a missing one: name the spelling
         first = next((e for e in errors if e["type"] == "extra_forbidden"), errors[0])
-        location = tuple(first["loc"])
+        location = _without_tags(first["loc"])
         message = first["msg"].removeprefix("Value error, ")
         inner = first.get("ctx", {}).get("error")
         if isinstance(inner, _LocatedError):
@@ -419,6 +437,11 @@ def _load(path: Path, model: type[P]) -> P:
             path, _sentence(location, message, first), _line(lines, location)
         ) from None
     return profile.model_copy(update={"path": path})
+
+
+def _without_tags(location: tuple[str | int, ...]) -> tuple[str | int, ...]:
+    """Leave out the effect's name, which pydantic puts behind its number in a list of effects."""
+    return tuple(p for k, p in enumerate(location) if k < 2 or location[k - 2] != "effects")
 
 
 def _sentence(location: tuple[str | int, ...], message: str, error: Mapping[str, Any]) -> str:

@@ -1,7 +1,7 @@
 """One axis in motion as the host sees it: what it sent last, what it may do, and what is wrong.
 
-One PDO each way and axis: controlword, target position, target torque; statusword, actual
-position, actual torque.
+One PDO each way and axis: controlword, target position, and target torque or torque offset;
+statusword, actual position, actual torque.
 """
 
 import struct
@@ -73,6 +73,10 @@ class Channel:
     span_begin: int | None = None
     span_count: int = 0
     too_fast: bool = False
+    takes_offset: bool = False
+    """Whether the torque in its PDO is the torque offset 0x60B2."""
+    offset: int = 0
+    """Torque offset sent last, per mille of the rated torque."""
 
     @property
     def state(self) -> PowerState | None:
@@ -214,7 +218,9 @@ class Channel:
         )
 
 
-def channel_of(drive: CanopenDrive, cycle_time: float, free: bool) -> Channel:
+def channel_of(
+    drive: CanopenDrive, cycle_time: float, free: bool, takes_offset: bool = False
+) -> Channel:
     """Return the run-time state of an axis about to be moved, its limits in drive units."""
     scale, limits = drive.scaling, drive.limits
     units = min(limits.velocity * cycle_time / scale.velocity, _MOST_UNITS)
@@ -229,6 +235,7 @@ def channel_of(drive: CanopenDrive, cycle_time: float, free: bool) -> Channel:
         span=span,
         span_units=1 + floor(units * span),
         torque=floor(min(limits.torque / scale.torque * (1 + 1e-12), _MOST_UNITS)),
+        takes_offset=takes_offset,
         still_allowed=max(3, round(STUCK_TIME / cycle_time)),
         window=floor(min(limits.following_error / scale.position * (1 + 1e-12), _MOST_UNITS)),
     )

@@ -3,6 +3,7 @@
 import sys
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
+from functools import cached_property
 
 import can
 
@@ -12,8 +13,9 @@ from drives.canopen_drive.drive import CanopenDrive
 from drives.canopen_drive.interrupts import uninterrupted
 from drives.canopen_drive.line import Line
 from drives.canopen_drive.motion import CanopenMotion
+from drives.canopen_drive.torque_offset import why_not
 from drives.cia402 import Mode
-from drives.errors import DrivesError, LimitsError, NothingMovedError
+from drives.errors import DrivesError, LimitsError, NothingMovedError, NotSupportedError
 from drives.objects import ObjectInfo
 from drives.profile import DriveProfile, MachineProfile, load_drive
 
@@ -58,9 +60,30 @@ class CanopenGroup:
         """Shortest cycle time that fits the bus, seconds."""
         return shortest_cycle(len(self._drives), self.machine.bus.bitrate)
 
+    @cached_property
+    def _offset_obstacles(self) -> tuple[str, ...]:
+        return tuple(why_not(d) for d in self._drives)
+
+    @property
+    def torque_offsets(self) -> tuple[bool, ...]:
+        """Of which axes the drive takes torque offsets (0x60B2) together with target positions.
+
+        Its profile says so, its EDS has the object as INTEGER16 that an RPDO may carry, and the
+        drive itself has it; asked once.
+
+        Raises
+        ------
+        SdoError
+            If a drive does not answer.
+        """
+        return tuple(not obstacle for obstacle in self._offset_obstacles)
+
     @contextmanager
     def without_feed_forward(self) -> Iterator[None]:
         """Switch the drives' feed-forward off while frequency responses are measured.
+
+        That is what the drives themselves derive from the targets; torque offsets that the host
+        streams act all the same.
 
         On leaving, whatever happened, it is what it was.
 
@@ -84,7 +107,9 @@ class CanopenGroup:
             yield
 
     @contextmanager
-    def motion(self, cycle_time: float, free: Collection[str] = ()) -> Iterator[CanopenMotion]:
+    def motion(
+        self, cycle_time: float, free: Collection[str] = (), torque_offset: bool = False
+    ) -> Iterator[CanopenMotion]:
         """Enable all axes: those in ``free`` float without torque, the others hold position.
 
         Whatever happens inside, on leaving the axes are stopped and disabled, and the drives'
@@ -96,22 +121,31 @@ class CanopenGroup:
             Seconds from SYNC to SYNC.
         free
             Names of axes in cyclic torque mode with zero torque.
+        torque_offset
+            Whether torque offsets are streamed with the positions (``drives.api.Targets``), to the
+            axes that :attr:`torque_offsets` shows; those of the others must be 0.
 
         Raises
         ------
         LimitsError
-            If the cycle does not fit the bus, or an axis may not float.
+            If the cycle does not fit the bus, or an axis may not float, or is to float while torque
+            offsets are streamed.
+        NotSupportedError
+            If torque offsets are asked for and no drive takes them.
         NothingMovedError
             If a drive can not be enabled.
         """
         self._check(cycle_time, free)
+        offsets = self._offset_axes(free) if torque_offset else frozenset()
         with ExitStack() as stack:
             for drive in self._drives:
                 changes = self._changes(stack, drive)
                 mode = Mode.CYCLIC_TORQUE if drive.axis in free else Mode.CYCLIC_POSITION
                 setup.cycle(drive, cycle_time, changes)
                 setup.mode(drive, mode, changes)
-                setup.process_data(drive, changes)
+                streamed = drive.axis in offsets
+                setup.clear_torque_offset(drive, changes, streamed=streamed)
+                setup.process_data(drive, changes, torque_offset=streamed)
             stack.callback(self.line.end_heartbeat)
             unsure: dict[str, str] = {}
             for drive in self._drives:  # last, and so first to be put back
@@ -123,7 +157,7 @@ class CanopenGroup:
             for drive in self._drives:
                 drive.node.nmt.send_command(START_NODE)
             motion = CanopenMotion(
-                self.line, self._drives, cycle_time, frozenset(free), self._stop_requested
+                self.line, self._drives, cycle_time, frozenset(free), self._stop_requested, offsets
             )
             motion.perhaps_enabled = unsure
             self.line.begin_heartbeat(setup.HOST_NODE_ID, setup.HOST_HEARTBEAT)
@@ -135,6 +169,20 @@ class CanopenGroup:
             except BaseException as error:
                 motion.stop(error)
                 raise
+
+    def _offset_axes(self, free: Collection[str]) -> frozenset[str]:
+        """Return the axes that torque offsets are streamed to."""
+        if free:
+            raise LimitsError(
+                f"{', '.join(free)}: can not float while torque offsets are streamed: both use the one "
+                "torque of the axis' PDO. Take either `free` or `torque_offset` in one motion."
+            )
+        if not any(self.torque_offsets):
+            raise NotSupportedError(
+                "no drive takes a torque offset together with target positions: "
+                f"{'; '.join(self._offset_obstacles)}. Measure with position references alone."
+            )
+        return frozenset(a for a, can in zip(self.axes, self.torque_offsets, strict=True) if can)
 
     def _check(self, cycle_time: float, free: Collection[str]) -> None:
         check_cycle(CyclicLoad(len(self._drives), cycle_time, self.machine.bus.bitrate))

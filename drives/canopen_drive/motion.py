@@ -10,11 +10,12 @@ from collections.abc import Callable, Sequence
 import can
 import numpy as np
 
-from drives.api import Capture, FloatArray, Source, joined
+from drives.api import Capture, FloatArray, Source, Targets, joined
 from drives.canopen_drive.channel import INPUT, OUTPUT, Channel, channel_of
 from drives.canopen_drive.drive import CanopenDrive
 from drives.canopen_drive.interrupts import uninterrupted
 from drives.canopen_drive.line import Line
+from drives.canopen_drive.outputs import Outputs, outputs_of
 from drives.canopen_drive.setup import HOST_LOST_AFTER
 from drives.cia402 import ENABLED_VALUE, STEP_TOWARDS_ENABLED, Controlword, PowerState
 from drives.errors import (
@@ -27,7 +28,6 @@ from drives.errors import (
 )
 
 INPUT_ROW = np.dtype([("statusword", "<u2"), ("position", "<i4"), ("torque", "<i2")])
-OUTPUT_ROW = np.dtype([("controlword", "<u2"), ("position", "<i4"), ("torque", "<i2")])
 
 STATE_TIMEOUT = 3.0
 """Seconds a drive may take from one power state to the next (a brake may have to open)."""
@@ -54,9 +54,12 @@ class CanopenMotion:
         cycle_time: float,
         free: frozenset[str],
         stop_requested: Callable[[], bool],
+        offsets: frozenset[str] = frozenset(),
     ) -> None:
         self._line, self._cycle_time, self._stop_requested = line, cycle_time, stop_requested
-        self._channels = [channel_of(d, cycle_time, d.axis in free) for d in drives]
+        self._channels = [
+            channel_of(d, cycle_time, d.axis in free, d.axis in offsets) for d in drives
+        ]
         self._by_cob = {0x180 + c.drive.node_id: k for k, c in enumerate(self._channels)}
         self._by_node = {c.drive.node_id: c for c in self._channels}
         self._sync = can.Message(arbitration_id=0x80, is_extended_id=False)
@@ -85,6 +88,11 @@ class CanopenMotion:
         """Which axes float."""
         return tuple(c.free for c in self._channels)
 
+    @property
+    def torque_offsets(self) -> tuple[bool, ...]:
+        """Which axes take torque offsets in this motion."""
+        return tuple(c.takes_offset for c in self._channels)
+
     def stream(self, source: Source) -> Capture:
         """Follow targets SYNC by SYNC; see ``drives.api.Motion``."""
         captures: list[Capture] = []
@@ -92,6 +100,7 @@ class CanopenMotion:
             previous: Capture | None = None
             while (block := source(previous)) is not None:
                 previous = self._follow(block, captures)
+            self._release_offsets()
         except BaseException as error:
             self.stop(error)
             stopped = _as_stopped(error)
@@ -299,10 +308,11 @@ class CanopenMotion:
 
     # --- the cycle -----------------------------------------------------------------------------
 
-    def _follow(self, targets: FloatArray, captures: list[Capture]) -> Capture:
+    def _follow(self, block: FloatArray | Targets, captures: list[Capture]) -> Capture:
         """Send a block of targets; what came back joins ``captures`` whatever happens."""
-        units, frames = self._outputs(targets)
-        first, n = self._count, targets.shape[0]
+        outputs = outputs_of(block, self._channels, self._count)
+        units, frames = outputs.units, outputs.frames
+        first, n = self._count, units.shape[0]
         received = [bytearray() for _ in self._channels]
         missing: list[int] = []
         row = 0
@@ -318,75 +328,36 @@ class CanopenMotion:
         finally:
             for k, channel in enumerate(self._channels):
                 channel.hold = int(units[row, k])  # what was sent last stays the target
-            captures.append(self._capture(first, targets, received, missing))
+                channel.offset = int(outputs.offset_units[row, k])
+            captures.append(self._capture(first, outputs, received, missing))
         return captures[-1]
 
-    def _outputs(
-        self, targets: FloatArray
-    ) -> tuple[np.ndarray[tuple[int, int], np.dtype[np.int32]], list[bytes]]:
-        """Return targets in position units, shape (n, M), and each axis' PDOs, 8 bytes a row."""
-        n, m = targets.shape[0], len(self._channels)
-        if targets.shape != (n, m) or not np.all(np.isfinite(targets)):
-            raise ValueError(f"targets must be finite, of shape (n, {m}), got {targets.shape}")
-        units = np.empty((n, m), dtype=np.int32)
-        frames: list[bytes] = []
-        for k, channel in enumerate(self._channels):
-            rows = np.zeros(n, dtype=OUTPUT_ROW)
-            rows["controlword"] = Controlword.ENABLE_OPERATION
-            if channel.free:
-                units[:, k] = channel.position
-            else:
-                wanted = np.rint(targets[:, k] / channel.drive.scaling.position)
-                self._check_inside(channel, wanted)
-                self._check_steps(channel, wanted)
-                units[:, k] = wanted
-            rows["position"] = units[:, k]
-            frames.append(rows.tobytes())
-        return units, frames
-
-    def _check_inside(self, channel: Channel, wanted: FloatArray) -> None:
-        outside = wanted[(wanted < channel.low) | (wanted > channel.high)]
-        if outside.size:
-            drive = channel.drive
-            raise SafetyStopError(
-                f"{drive.axis}: a target of {outside[0] * drive.scaling.position:.4g} "
-                f"{drive.position_unit} is outside the travel {drive.limits.travel[0]:g} to "
-                f"{drive.limits.travel[1]:g} {drive.position_unit}; it was not sent, and all axes "
-                "were stopped.",
-                axis=drive.axis,
-                cycle=self._count,
-            )
-
-    def _check_steps(self, channel: Channel, wanted: FloatArray) -> None:
-        """Refuse a target further from the one before than a following error may be."""
-        begin = channel.position if channel.hold is None else channel.hold
-        steps = np.abs(np.diff(wanted, prepend=float(begin)))
-        if steps.size and steps.max() > channel.window:
-            drive = channel.drive
-            scale, unit = drive.scaling.position, drive.position_unit
-            raise SafetyStopError(
-                f"{drive.axis}: a target would jump by {steps.max() * scale:.4g} {unit} from one cycle "
-                f"to the next, more than the following error {channel.window * scale:.4g} {unit} that "
-                "is allowed; it was not sent, and all axes were stopped.",
-                axis=drive.axis,
-                cycle=self._count,
-            )
+    def _release_offsets(self) -> None:
+        """Take torque offsets away when a stream ends: nobody may think of them until the next."""
+        channels = self._channels
+        if any(c.offset for c in channels):
+            self._cycle([self._word(c, Controlword.ENABLE_OPERATION) for c in channels])
+            for channel in channels:
+                channel.offset = 0
+            held = [c.position if c.hold is None else c.hold for c in channels]
+            self._check(np.array(held, dtype=np.int32))
 
     def _capture(
-        self, first: int, targets: FloatArray, received: list[bytearray], missing: list[int]
+        self, first: int, outputs: Outputs, received: list[bytearray], missing: list[int]
     ) -> Capture:
         rows = min(len(raw) for raw in received) // INPUT.size
         tables = [np.frombuffer(bytes(raw[: rows * 8]), dtype=INPUT_ROW) for raw in received]
         scales = [c.drive.scaling for c in self._channels]
         return Capture(
             first,
-            np.array(targets[:rows], dtype=np.float64),
+            np.array(outputs.position[:rows], dtype=np.float64),
             np.stack(
                 [t["position"] * s.position for t, s in zip(tables, scales, strict=True)], axis=1
             ),
             np.stack([t["torque"] * s.torque for t, s in zip(tables, scales, strict=True)], axis=1),
             np.stack([t["statusword"] for t in tables], axis=1),
             tuple(missing),
+            outputs.torque_offset[:rows] if any(self.torque_offsets) else None,
         )
 
     def _cycle(self, outputs: Sequence[bytes]) -> bool:
@@ -451,6 +422,7 @@ class CanopenMotion:
             self._line.notify(message.arbitration_id, message.data, message.timestamp)
 
     def _word(self, channel: Channel, word: Controlword) -> bytes:
+        """Return a PDO that holds the position; target torque and torque offset are always 0."""
         position = channel.position if channel.hold is None else channel.hold
         return OUTPUT.pack(word, position, 0)
 

@@ -2,6 +2,7 @@
 
 from drives import objects
 from drives.canopen_drive.drive import CanopenDrive
+from drives.canopen_drive.torque_offset import TORQUE_OFFSET
 from drives.cia402 import Mode
 from drives.errors import DrivesError, NotSupportedError, SdoAbortError, SdoTimeoutError
 from drives.objects import ObjectAddress, ObjectInfo, type_bits
@@ -22,6 +23,7 @@ DRIVE_HEARTBEAT = 0.1
 """Seconds between a drive's heartbeats while the machine moves."""
 
 OUTPUTS = (objects.CONTROLWORD, objects.TARGET_POSITION, objects.TARGET_TORQUE)
+OUTPUTS_WITH_OFFSET = (objects.CONTROLWORD, objects.TARGET_POSITION, TORQUE_OFFSET)
 INPUTS = (objects.STATUSWORD, objects.POSITION_ACTUAL, objects.TORQUE_ACTUAL)
 
 
@@ -149,8 +151,34 @@ def cycle(drive: CanopenDrive, cycle_time: float, changes: TemporaryObjects) -> 
         changes.change(objects.SYNC_PERIOD, round(cycle_time * 1e6), period)
 
 
-def process_data(drive: CanopenDrive, changes: TemporaryObjects) -> None:
+def clear_torque_offset(drive: CanopenDrive, changes: TemporaryObjects, *, streamed: bool) -> None:
+    """Let the drive add no torque of its own accord: 0x60B2 is 0 before it is enabled.
+
+    What somebody left there would push an axis that holds its position, and one that floats.  Where
+    the offset is streamed it is put back in any case, because what was sent last may have stayed.
+
+    Raises
+    ------
+    NotSupportedError
+        If the drive keeps another value.
+    SdoError
+        If the object can not be read or written.
+    """
+    info = drive.info(TORQUE_OFFSET.address)
+    before = None if info is None else drive.read_optional(info)
+    if info is None or before is None:
+        return
+    if streamed and before == 0:
+        changes.note(info, 0)
+    changes.change(info, 0, before)
+
+
+def process_data(
+    drive: CanopenDrive, changes: TemporaryObjects, *, torque_offset: bool = False
+) -> None:
     """Map one PDO each way, 8 bytes, taken over at every SYNC; switch the drive's others off.
+
+    With ``torque_offset`` the torque that goes out is 0x60B2 in place of the target torque 0x6071.
 
     Raises
     ------
@@ -159,7 +187,8 @@ def process_data(drive: CanopenDrive, changes: TemporaryObjects) -> None:
     SdoError
         If the drive refuses the mapping.
     """
-    for wanted in (*OUTPUTS, *INPUTS):
+    outputs = OUTPUTS_WITH_OFFSET if torque_offset else OUTPUTS
+    for wanted in (*outputs, *INPUTS):
         info = drive.info(wanted.address)
         if info is not None and type_bits(info.type) != type_bits(wanted.type):
             raise NotSupportedError(
@@ -167,7 +196,7 @@ def process_data(drive: CanopenDrive, changes: TemporaryObjects) -> None:
                 f"{info.type}, the tool's PDOs need {wanted.type}."
             )
     for communication, mapping, cob_id, entries in (
-        (0x1400, 0x1600, 0x200, OUTPUTS),
+        (0x1400, 0x1600, 0x200, outputs),
         (0x1800, 0x1A00, 0x180, INPUTS),
     ):
         for other in range(3, 0, -1):

@@ -1,22 +1,29 @@
 """Parts that can be added to the plain chains of masses and springs, named as in ``model.yaml``.
 
-There are two ways for a part to act, and they meet the plant at two places:
+There are three ways for a part to act, and each meets the plant at a place of its own:
 
 - A *linear* part changes the matrices of M q'' + C q' + K q = f before anything moves; it has the
   shape of :class:`LinearEffect` and costs nothing while the plant is stepped.
-- A part with a bend or a memory (dry friction, a gap) can not stand in a matrix.  It is a
-  generalised force f on single masses, evaluated once an inner step and held over it; that is why
+- A *holding* part (dry friction) takes a mass out of the motion while it sticks and is a constant
+  force on it while it slides.  It has the shape of :class:`HoldingEffect`; a plant with one is
+  stepped piece by piece, each piece exact (:mod:`drives.sim.stick_slip`).
+- A part with a bend (a gap, a hardening spring) is a generalised force f on single masses,
+  evaluated once an inner step and held over it; that is why
   :meth:`drives.sim.plant.Plant.discretise` gives the input matrix of *every* mass.
+
+A part of a chain says where it sits by its ``location``; the plant numbers the masses.
 """
 
 from dataclasses import dataclass
 from math import isfinite
-from typing import Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
+Location = Literal["motor", "load"]
+"""First or last mass of a chain; on a rigid axis they are one."""
 
 
 class LinearEffect(Protocol):
@@ -24,6 +31,20 @@ class LinearEffect(Protocol):
 
     def damping(self, size: int) -> FloatArray:
         """What the part adds to C of a plant with ``size`` masses, shape (size, size)."""
+        ...
+
+
+class HoldingEffect(Protocol):
+    """What the plant asks of a part that can hold a mass still."""
+
+    @property
+    def location(self) -> Location:
+        """Which mass of its chain it holds."""
+        ...
+
+    @property
+    def torque(self) -> float:
+        """Largest torque (or force) that it holds against and that acts while the mass slides."""
         ...
 
 
@@ -58,3 +79,40 @@ class ViscousFriction:
         matrix = np.zeros((size, size))
         matrix[self.mass, self.mass] = self.coefficient
         return matrix
+
+
+@dataclass(frozen=True)
+class CoulombFriction:
+    """Dry friction between one mass of a chain and ground; model name coulomb_friction.
+
+    Sliding, the mass feels -torque * sign(q').  At standstill the friction is what keeps it there,
+    as long as that is at most the same torque; then the mass breaks away.
+
+    Valid for: slideways, seals and gears whose friction depends neither on speed nor on how long
+    they stood; breakaway is not above sliding friction.
+
+    Raises
+    ------
+    ValueError
+        If the torque is negative or not finite, or the location is none.
+    """
+
+    torque: float
+    """N m (rotary) or N (linear), at least 0; 0 is no friction."""
+    location: Location = "motor"
+
+    def __post_init__(self) -> None:
+        if self.location not in ("motor", "load"):
+            raise ValueError(
+                f"coulomb friction: location {self.location!r} must be motor (first mass of the "
+                "chain) or load (last mass)"
+            )
+        if not (isfinite(self.torque) and self.torque >= 0.0):
+            raise ValueError(
+                f"coulomb friction at the {self.location}: torque {self.torque} N m (N) must be "
+                "finite and at least 0"
+            )
+
+
+ChainEffect = CoulombFriction
+"""Every part that a chain can be given; a union once there are more."""

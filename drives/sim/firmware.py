@@ -23,8 +23,9 @@ from drives.errors import DrivesError
 from drives.sim import servo_kernel
 from drives.sim.biquad import FilterType, biquad
 from drives.sim.plant import Plant, PlantParameters
-from drives.sim.servo_kernel import Derived, Parameter, Reference, Signal
+from drives.sim.servo_kernel import Derived, Outcome, Parameter, Reference, Signal
 from drives.sim.servo_settings import DriveHardware, ParameterRange, factory_values, ranges
+from drives.sim.stick_slip import StickSlip
 from drives.sim.trapezoid import plan_trapezoid
 
 __all__ = [
@@ -110,6 +111,9 @@ class SimulatedAxes:
         increment, forced = self.plant.increments(self._step)
         self._increments = np.ascontiguousarray(np.hstack([increment, forced[:, self._motors]]).T)
         self._state = np.zeros(2 * self.plant.size)
+        self._stick_slip: StickSlip | None = None
+        if self.plant.breakaway.any():
+            self._stick_slip = StickSlip(self.plant, self._step)
         axes = len(self.hardware)
         self._signals = np.zeros((axes, Signal.COLUMNS))
         self._settings = np.zeros((axes, Derived.COLUMNS))
@@ -139,15 +143,18 @@ class SimulatedAxes:
         """
         if steps < 0:
             raise ValueError(f"can not advance by {steps} inner steps: time does not run backwards")
-        good = servo_kernel.advance(
-            steps,
-            self._step,
-            self._state,
-            self._signals,
-            self._settings,
-            self._increments,
-            self._motors,
-        )
+        if self._stick_slip is not None:
+            good = self._advance_holding(steps, self._stick_slip)
+        else:
+            good = servo_kernel.advance(
+                steps,
+                self._step,
+                self._state,
+                self._signals,
+                self._settings,
+                self._increments,
+                self._motors,
+            )
         self._steps += steps
         if not good:
             raise SimulationDivergedError(
@@ -155,6 +162,22 @@ class SimulatedAxes:
                 "velocity is not finite or beyond 2^53 encoder counts; nothing read from it is a "
                 "measurement"
             )
+
+    def _advance_holding(self, steps: int, stick_slip: StickSlip) -> bool:
+        """With dry friction; tables that turn out to be missing are made on the way."""
+        while True:
+            outcome = servo_kernel.advance_holding(
+                steps,
+                self._step,
+                self._state,
+                self._signals,
+                self._settings,
+                self._motors,
+                stick_slip.tables,
+            )
+            if outcome != Outcome.NEEDS_SET:
+                return bool(outcome == Outcome.DONE)
+            stick_slip.add_set()
 
     @property
     def time(self) -> float:
@@ -191,6 +214,8 @@ class SimulatedAxes:
         if on:
             raise RuntimeError(f"axes {on} are on; switch them off before setting the state")
         self._state[:] = state
+        if self._stick_slip is not None:
+            self._stick_slip.set_state(state)
         for axis, row in enumerate(self._rows):
             scale = self.hardware[axis].counts_per_unit
             motor = int(self._motors[axis])

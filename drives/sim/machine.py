@@ -7,13 +7,14 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Literal
 
 from drives.sim.dictionary import Key, Value
+from drives.sim.effects import ChainEffect, CoulombFriction
 from drives.sim.entries import ENTRIES
 from drives.sim.firmware import DriveHardware
 from drives.sim.plant import ChainParameters, PlantParameters
 from drives.sim.scales import Scales, gain_objects
 
 if TYPE_CHECKING:
-    from drives.profile import MachineProfile
+    from drives.profile import EffectProfile, MachineProfile
 
 Kind = Literal["rotary", "linear"]
 
@@ -202,6 +203,7 @@ def simulated_machine(profile: "MachineProfile") -> SimulatedMachine:
                     springs=truth.springs,
                     dampers=truth.dampers or (0.0,) * len(truth.springs),
                     viscous_friction=truth.viscous_friction,
+                    effects=tuple(_effect(part) for part in truth.effects),
                 ),
                 rated_torque=truth.rated_torque,
                 peak_torque=truth.peak_torque,
@@ -216,3 +218,9 @@ def simulated_machine(profile: "MachineProfile") -> SimulatedMachine:
         (names.index(c.axes[0]), names.index(c.axes[1]), c.value) for c in simulation.couplings
     )
     return SimulatedMachine(tuple(drives), couplings, simulation.seed)
+
+
+def _effect(part: "EffectProfile") -> ChainEffect:
+    match part.effect:
+        case "coulomb_friction":
+            return CoulombFriction(part.torque, part.location)

@@ -12,6 +12,9 @@ axes; kg m2, N m/rad, N m s/rad, N m, rad on rotary ones.  A state is (q, q'), s
 
 Valid for: any number of chains of any length, N = 1 being a rigid axis.  Nothing holds the machine
 to the ground, so there are as many rigid-body modes as chains.
+
+Dry friction holds single masses still; matrices, response and steps here are those of the machine
+between its events, with no mass or some masses held (:mod:`drives.sim.stick_slip` says when).
 """
 
 from collections.abc import Sequence
@@ -22,7 +25,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import expm
 
-from drives.sim.effects import FloatArray, LinearEffect, ViscousFriction
+from drives.sim.effects import ChainEffect, FloatArray, LinearEffect, ViscousFriction
 
 ComplexArray = NDArray[np.complex128]
 
@@ -45,6 +48,8 @@ class ChainParameters:
     """N - 1 dampers beside the springs, N s/m or N m s/rad, at least 0."""
     viscous_friction: float = 0.0
     """Between the first mass and ground, N s/m or N m s/rad, at least 0."""
+    effects: tuple[ChainEffect, ...] = ()
+    """What else acts; parts of a kind at the same mass add up."""
 
     def __post_init__(self) -> None:
         links = len(self.masses) - 1
@@ -145,6 +150,8 @@ class Plant:
             start=_between_neighbours(counts, [chain.dampers for chain in parameters.chains]),
         )
         """C, shape (n, n)."""
+        self.breakaway: FloatArray = _breakaway(parameters)
+        """Dry friction on each mass, N m (or N), shape (n,); 0 where there is none."""
 
     @property
     def eigenfrequencies(self) -> FloatArray:
@@ -159,7 +166,7 @@ class Plant:
         return np.sqrt(eigenvalues)
 
     def response(self, omega: ArrayLike) -> ComplexArray:
-        """Motor positions per motor torque of the continuous plant.
+        """Motor positions per motor torque of the continuous plant, without dry friction.
 
         Parameters
         ----------
@@ -203,8 +210,10 @@ class Plant:
         increment, forced = self.increments(step)
         return np.eye(2 * self.size) + increment, forced
 
-    def increments(self, step: float) -> tuple[FloatArray, FloatArray]:
+    def increments(self, step: float, held: Sequence[int] = ()) -> tuple[FloatArray, FloatArray]:
         """(Ad - I, Bd) of :meth:`discretise`: what the stepping loop adds to the state.
+
+        Masses that are ``held`` stand still: their rows are exactly 0.
 
         Both follow from Phi, the integral of exp(A t) over the step: Ad - I = Phi A, Bd = Phi B.
         Phi is a block of the exponential of an augmented matrix, which needs no inverse of A; A is
@@ -216,12 +225,15 @@ class Plant:
         if not (isfinite(step) and step > 0.0):
             raise ValueError(f"step is {step} s; it must be finite and above 0")
         order = 2 * self.size
-        rates, forced = self._first_order()
+        rates, forced = self.first_order(held)
         augmented = np.zeros((2 * order, 2 * order))
         augmented[:order, :order] = rates * step
         augmented[:order, order:] = np.eye(order) * step
         phi = np.asarray(expm(augmented), dtype=np.float64)[:order, order:]
-        return phi @ rates, phi @ forced
+        increment, pushed = phi @ rates, phi @ forced
+        still = [*held, *(self.size + mass for mass in held)]
+        increment[still], pushed[still] = 0.0, 0.0
+        return increment, pushed
 
     def energy(self, state: FloatArray) -> float:
         """Kinetic and elastic energy of a state (q, q'), shape (2n,), J."""
@@ -230,14 +242,16 @@ class Plant:
         elastic = positions @ self.stiffness_matrix @ positions
         return float(0.5 * (kinetic + elastic))
 
-    def _first_order(self) -> tuple[FloatArray, FloatArray]:
-        """A (2n, 2n) and B (2n, n) of x' = A x + B f."""
+    def first_order(self, held: Sequence[int] = ()) -> tuple[FloatArray, FloatArray]:
+        """A (2n, 2n) and B (2n, n) of x' = A x + B f, with masses that are held at velocity 0."""
         n = self.size
+        free = np.setdiff1d(np.arange(n), np.asarray(held, dtype=np.intp))
+        moving = self.mass_matrix[np.ix_(free, free)]
         rates, forced = np.zeros((2 * n, 2 * n)), np.zeros((2 * n, n))
-        rates[:n, n:] = np.eye(n)
-        rates[n:, :n] = -np.linalg.solve(self.mass_matrix, self.stiffness_matrix)
-        rates[n:, n:] = -np.linalg.solve(self.mass_matrix, self.damping_matrix)
-        forced[n:] = np.linalg.inv(self.mass_matrix)
+        rates[free, n + free] = 1.0
+        rates[n + free, :n] = -np.linalg.solve(moving, self.stiffness_matrix[free])
+        rates[n + free, n:] = -np.linalg.solve(moving, self.damping_matrix[free])
+        forced[np.ix_(n + free, free)] = np.linalg.inv(moving)
         return rates, forced
 
 
@@ -250,6 +264,17 @@ def _above_zero(name: str, unit: str, values: Sequence[float]) -> None:
 def _first_masses(parameters: PlantParameters) -> NDArray[np.intp]:
     counts = [0, *(len(chain.masses) for chain in parameters.chains[:-1])]
     return np.cumsum(counts).astype(np.intp)
+
+
+def _breakaway(parameters: PlantParameters) -> FloatArray:
+    torques = np.zeros(sum(len(chain.masses) for chain in parameters.chains))
+    first = 0
+    for chain in parameters.chains:
+        last = first + len(chain.masses) - 1
+        for effect in chain.effects:
+            torques[first if effect.location == "motor" else last] += effect.torque
+        first = last + 1
+    return torques
 
 
 def _mass_matrix(parameters: PlantParameters) -> FloatArray:

@@ -18,17 +18,23 @@ jerk: the position reference follows the position outside of the position modes,
 follows the torque reference in torque mode, the torque reference follows the PI's output outside of
 torque mode.
 
+A plant with dry friction is stepped piece by piece inside the inner step; how stands in
+:mod:`drives.sim.stick_slip`, which makes the tables that :class:`Holding` names.
+
 Columns of the arrays are named by the enumerations below, which is why these live here: numba's
 cache sees changes in this file only.
 """
 
 from enum import IntEnum
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
 
 
 class Parameter(IntEnum):
@@ -168,6 +174,81 @@ class Signal(IntEnum):
     COLUMNS = 46
 
 
+class Progress(IntEnum):
+    """Columns of what the stepping with friction remembers of an inner step."""
+
+    STEPS = 0
+    """Inner steps of this call that are done."""
+    LEFT = 1
+    """Ticks of the present inner step still to go; 0 before it has begun."""
+    BRACKET = 2
+    """The next event is known to lie within so many ticks; 0 if none is known."""
+    PENDING = 3
+    """A ``Pending``."""
+    EVENTS = 4
+    """Times that masses would have turned back since time last went on."""
+    COLUMNS = 5
+
+
+class Pending(IntEnum):
+    """What is to be done before time goes on."""
+
+    NOTHING = 0
+    CHECK = 1
+    """See whether friction can hold all masses that stand."""
+    STOP = 2
+    """See whether friction can hold masses whose velocity is about to pass zero."""
+    REST = 3
+    """Take what is left of the velocity of those that it holds."""
+
+
+class Outcome(IntEnum):
+    """How stepping with friction ended."""
+
+    DONE = 0
+    DIVERGED = 1
+    NEEDS_SET = 2
+    """The tables have nothing for the masses that stand now: add it and call again."""
+
+
+class Holding(NamedTuple):
+    """Dry friction of a plant: F masses that can stick, S sets of standing masses tabulated so far.
+
+    C = 2n + M + F columns stand for state, motor torques and friction torques.
+    """
+
+    masses: IntArray
+    """Numbers of the masses, shape (F,)."""
+    limits: FloatArray
+    """Friction torques, N m, shape (F,)."""
+    accelerations: FloatArray
+    """Of the masses with friction while all move, per column, shape (F, C)."""
+    mobility: FloatArray
+    """Of the masses with friction per friction torque, 1/(kg m2), shape (F, F)."""
+    directions: FloatArray
+    """-1, 1: slides that way, 0: stands; shape (F,), changed."""
+    passing: BoolArray
+    """Velocity passes zero in the present tick; shape (F,), changed."""
+    inputs: FloatArray
+    """Shape (C,), changed."""
+    progress: IntArray
+    """Shape (Progress.COLUMNS,), changed."""
+    standing: BoolArray
+    """The sets, shape (S, F)."""
+    increments: FloatArray
+    """What each column adds to the state in a piece, shape (S, LEVELS, C, 2n); level k has
+    TICKS / 2^k ticks."""
+    reactions: FloatArray
+    """Friction torque that keeps a standing mass where it is, shape (S, F, C)."""
+    carried: FloatArray
+    """Velocity that all masses get per velocity taken from one that stops, shape (S, F, n)."""
+
+
+LEVELS = 9
+TICKS = 2 ** (LEVELS - 1)
+"""Of an inner step: events are located to one tick, 0.5 us at 8 kHz."""
+SWEEPS = 200
+"""At most, over masses that break away together."""
 POSITION_MODE, PROFILE_MODE = int(Reference.POSITION), int(Reference.PROFILE)
 LARGEST_COUNT = 2.0**53
 """Counts beyond this are no longer whole numbers in float64."""
@@ -387,13 +468,220 @@ def advance(steps, step, state, signals, settings, increments, motors):  # type:
                 state[i] += increments[j, i] * value
         for axis in range(axes):
             _sample(signals[axis], settings[axis], state[motors[axis]], step)
+    return _countable(state, settings, motors)
+
+
+@njit(cache=True)
+def _countable(state, settings, motors):  # type: ignore[no-untyped-def]
+    """Every number is finite and within what the encoders can count."""
     good = True
-    for i in range(order):
+    for i in range(state.size):
         good = good and np.isfinite(state[i])
-    for axis in range(axes):
+    for axis in range(motors.size):
         counts = state[motors[axis]] * settings[axis, Derived.COUNTS_PER_UNIT]
         good = good and abs(counts) <= LARGEST_COUNT
     return good
+
+
+@njit(cache=True)
+def advance_holding(steps, step, state, signals, settings, motors, holding):  # type: ignore[no-untyped-def]
+    """Step plant and drives as :func:`advance`, with friction; returns an ``Outcome``.
+
+    After NEEDS_SET the same call goes on where it stopped, even within an inner step.
+
+    Parameters
+    ----------
+    steps, step, state, signals, settings, motors
+        As for :func:`advance`.
+    holding
+        A ``Holding``; its progress begins with zeros.
+    """
+    order, axes = state.size, motors.size
+    progress, inputs = holding.progress, holding.inputs
+    change = np.empty(order)
+    while progress[Progress.STEPS] < steps:
+        if progress[Progress.LEFT] == 0:
+            for axis in range(axes):
+                torque = _control(signals[axis], settings[axis], step)
+                inputs[order + axis] = settings[axis, Derived.MOTOR_SIGN] * torque
+            progress[Progress.LEFT] = TICKS
+            progress[Progress.BRACKET] = 0
+            progress[Progress.PENDING] = Pending.CHECK
+            progress[Progress.EVENTS] = 0
+        if not _move_holding(state, axes, holding, change):
+            return Outcome.NEEDS_SET
+        for axis in range(axes):
+            _sample(signals[axis], settings[axis], state[motors[axis]], step)
+        progress[Progress.STEPS] += 1
+    progress[Progress.STEPS] = 0
+    if _countable(state, settings, motors):
+        return Outcome.DONE
+    return Outcome.DIVERGED
+
+
+@njit(cache=True)
+def _move_holding(state, axes, holding, change):  # type: ignore[no-untyped-def]
+    """Move the plant to the end of the inner step, piece by piece; False if a set is missing."""
+    order, progress, inputs = state.size, holding.progress, holding.inputs
+    while progress[Progress.LEFT] > 0:
+        found = _find_set(holding)
+        if found < 0:
+            return False
+        pending = progress[Progress.PENDING]
+        if pending == Pending.REST:
+            _take_velocity(state, holding, found)
+        for i in range(order):
+            inputs[i] = state[i]
+        for k in range(holding.masses.size):
+            acts = not holding.passing[k]
+            inputs[order + axes + k] = -holding.limits[k] * holding.directions[k] * acts
+        progress[Progress.PENDING] = Pending.NOTHING
+        if pending == Pending.CHECK or pending == Pending.STOP:  # noqa: PLR1714
+            freed = not _holds(holding, found) and _break_away(holding)
+            if pending == Pending.STOP:
+                for k in range(holding.masses.size):
+                    holding.passing[k] = holding.passing[k] and holding.directions[k] != 0.0
+                progress[Progress.PENDING] = Pending.REST
+            if freed or pending == Pending.STOP:
+                continue
+        _try_piece(state, holding, found, change)
+    return True
+
+
+@njit(cache=True)
+def _try_piece(state, holding, found, change):  # type: ignore[no-untyped-def]
+    """Take a piece of the step if nothing happens in it, else look closer or note the event."""
+    order, progress, inputs = state.size, holding.progress, holding.inputs
+    wanted = progress[Progress.LEFT]
+    if holding.passing.any():
+        wanted = 1
+    elif progress[Progress.BRACKET] > 0:
+        wanted = max(progress[Progress.BRACKET] // 2, 1)
+    level, ticks = 0, TICKS
+    while ticks > wanted:
+        level, ticks = level + 1, ticks // 2
+    table = holding.increments[found, level]
+    for i in range(order):
+        change[i] = 0.0
+    for j in range(inputs.size):
+        value = inputs[j]
+        for i in range(order):
+            change[i] += table[j, i] * value
+    last = ticks == 1
+    if _turns_back(state, holding, change, last):
+        progress[Progress.BRACKET] = 0 if last else ticks
+        return
+    for i in range(order):
+        inputs[i] = state[i] + change[i]
+    holds = _holds(holding, found)
+    if not (holds or last):
+        progress[Progress.BRACKET] = ticks
+        return
+    for i in range(order):
+        state[i] += change[i]
+    progress[Progress.LEFT] -= ticks
+    progress[Progress.BRACKET] = max(progress[Progress.BRACKET] - ticks, 0)
+    progress[Progress.EVENTS] = 0
+    holding.passing[:] = False
+    if not holds:
+        progress[Progress.BRACKET] = 0
+        progress[Progress.PENDING] = Pending.CHECK
+
+
+@njit(cache=True)
+def _find_set(holding):  # type: ignore[no-untyped-def]
+    """Row of the tables for the masses that stand now, or -1."""
+    for row in range(holding.standing.shape[0]):
+        same = True
+        for k in range(holding.masses.size):
+            same = same and holding.standing[row, k] == (holding.directions[k] == 0.0)
+        if same:
+            return row
+    return -1
+
+
+@njit(cache=True)
+def _take_velocity(state, holding, found):  # type: ignore[no-untyped-def]
+    """Bring standing masses to velocity 0 by a push on them alone: the others' momentum stays."""
+    size = state.size // 2
+    for k in range(holding.masses.size):
+        mass = holding.masses[k]
+        velocity = state[size + mass]
+        if holding.directions[k] == 0.0 and velocity != 0.0:
+            for i in range(size):
+                state[size + i] += holding.carried[found, k, i] * velocity
+            state[size + mass] = 0.0
+
+
+@njit(cache=True)
+def _turns_back(state, holding, change, last):  # type: ignore[no-untyped-def]
+    """A sliding mass would go against its direction in this piece; if it is the last, note which.
+
+    Where there is none, friction takes energy out of the machine in this piece.
+    """
+    size, count, progress = state.size // 2, holding.masses.size, holding.progress
+    endless = progress[Progress.EVENTS] > 2 * count
+    found = False
+    for k in range(count):
+        mass, direction = holding.masses[k], holding.directions[k]
+        velocity = state[size + mass] + change[size + mass]
+        against = direction * velocity < 0.0 or direction * change[mass] < 0.0
+        if against and not holding.passing[k]:
+            found = True
+            if last:
+                holding.passing[k] = True
+                if not endless:
+                    holding.directions[k] = 0.0
+    if found and last:
+        progress[Progress.EVENTS] += 1
+        if not endless:
+            progress[Progress.PENDING] = Pending.STOP
+    return found
+
+
+@njit(cache=True)
+def _holds(holding, found):  # type: ignore[no-untyped-def]
+    """Friction can keep every standing mass where it is, with the state that inputs hold."""
+    for k in range(holding.masses.size):
+        if holding.directions[k] == 0.0:
+            needed = 0.0
+            for j in range(holding.inputs.size):
+                needed += holding.reactions[found, k, j] * holding.inputs[j]
+            if abs(needed) > holding.limits[k]:
+                return False
+    return True
+
+
+@njit(cache=True)
+def _break_away(holding):  # type: ignore[no-untyped-def]
+    """Let go what friction can not hold; True if that is any mass.
+
+    Friction r of the standing masses is the one minimum of r' W r / 2 + r' a within the limits,
+    with W the mobility and a the accelerations without it: a mass whose friction stays within
+    stands, one at its limit accelerates against it.  Found by relaxing mass after mass.
+    """
+    count = holding.masses.size
+    friction, acceleration = np.zeros(count), holding.accelerations @ holding.inputs
+    for _ in range(SWEEPS):
+        moved = False
+        for k in range(count):
+            if holding.directions[k] == 0.0:
+                limit, own = holding.limits[k], holding.mobility[k, k]
+                wanted = min(max(friction[k] - acceleration[k] / own, -limit), limit)
+                difference = wanted - friction[k]
+                moved = moved or abs(difference) > 1e-14 * limit
+                friction[k] = wanted
+                for i in range(count):
+                    acceleration[i] += holding.mobility[i, k] * difference
+        if not moved:
+            break
+    freed = False
+    for k in range(count):
+        pushed = abs(friction[k]) == holding.limits[k] and friction[k] * acceleration[k] < 0.0
+        if holding.directions[k] == 0.0 and pushed:
+            holding.directions[k] = np.sign(acceleration[k])
+            freed = True
+    return freed
 
 
 @njit(cache=True)
