@@ -7,6 +7,7 @@
     ├── OutputError              a folder or file can not be written
     ├── PlanRefusedError         the experiment would leave a limit, or nothing safe is possible
     └── IdentificationError      the data do not allow the answer
+        ├── LoopUnstableError    a position loop became unstable while it was measured
         ├── NotAChainError       the modes can not come from chains driven at their ends
         └── NotEnoughDataError   too few lines, too much noise, nothing moved
 """
@@ -40,6 +41,16 @@ class PlanRefusedError(FieldtoolError):
 
 class IdentificationError(FieldtoolError):
     """The data do not allow the answer that was asked for."""
+
+
+class LoopUnstableError(IdentificationError):
+    """An oscillation of a position loop grew by itself while it was measured; the axes were stopped."""
+
+    def __init__(self, message: str, *, axis: str, frequency: float) -> None:
+        self.axis = axis
+        self.frequency = frequency
+        """Of the growing oscillation, Hz."""
+        super().__init__(message)
 
 
 class NotAChainError(IdentificationError):

@@ -20,6 +20,7 @@ from typing import Annotated, Any
 
 import typer
 from rich.console import Console
+from rich.text import Text
 
 from drives.errors import (
     BusError,
@@ -88,7 +89,19 @@ Store = Annotated[
     bool, typer.Option("--store", help="Keep the new parameters in non-volatile memory too.")
 ]
 Plan = Annotated[
-    str, typer.Option("--plan", help="How to measure: classic (stepped sines; axes float in turn).")
+    str,
+    typer.Option(
+        "--plan",
+        help="How to measure: fast (all axes at once under position control, about a minute) or classic "
+        "(stepped sines; axes float in turn, about an hour).",
+    ),
+]
+Seconds = Annotated[
+    float | None,
+    typer.Option("--time", help="Seconds of excitation that the fast plan may take.", min=1.0),
+]
+PlanOnly = Annotated[
+    bool, typer.Option("--plan-only", help="Show what would be measured, and end there.")
 ]
 Motor = Annotated[
     str,
@@ -136,6 +149,7 @@ class _StoppableScreen:
         self._screen, self._key = screen, key
         self.say, self.plan, self.progress = screen.say, screen.plan, screen.progress
         self.ready, self.found, self.designed = screen.ready, screen.found, screen.designed
+        self.fast_plan = screen.fast_plan
 
     def stage(self, title: str) -> None:
         self._key.check()
@@ -165,13 +179,20 @@ def _folder(out: Path | None, name: str) -> Path:
     return Path("sessions") / f"{Path(name).stem}-{datetime.now():%Y%m%d-%H%M%S}"
 
 
-def _options(plan: str, write: bool, store: bool, motor: str) -> workflow.Options:
-    if plan != "classic":
-        raise typer.BadParameter(f"no plan is called {plan!r}; there is: classic")
+def _options(
+    plan: str, write: bool, store: bool, motor: str, seconds: float | None = None
+) -> workflow.Options:
+    if plan not in ("classic", "fast"):
+        raise typer.BadParameter(f"no plan is called {plan!r}; there are: fast, classic")
+    if plan == "classic" and seconds is not None:
+        raise typer.BadParameter(
+            "--time is for the fast plan; the classic plan takes what it needs"
+        )
     if motor not in ("measured", "data-sheet"):
         raise typer.BadParameter(f"--motor-inertia is measured or data-sheet, got {motor!r}")
     return workflow.Options(
-        plan="classic",
+        plan="classic" if plan == "classic" else "fast",
+        excitation_time=seconds,
         write=write,
         store=store,
         motor_inertia="measured" if motor == "measured" else "data sheet",
@@ -212,19 +233,24 @@ def _print_json(data: Mapping[str, Any]) -> None:
 @app.command()
 def run(
     machine: Machine,
-    plan: Plan = "classic",
+    plan: Plan = "fast",
     write: Annotated[
         bool, typer.Option("--write/--no-write", help="Write the new parameters into the drives.")
     ] = False,
     yes: Yes = False,
     store: Store = False,
     motor_inertia: Motor = "measured",
+    seconds: Seconds = None,
+    plan_only: PlanOnly = False,
     out: Out = None,
     as_json: Json = False,
 ) -> None:
     """MOVES THE MACHINE. Measure, identify, design and, with --write, write back."""
-    options = _options(plan, write, store, motor_inertia)
+    options = _options(plan, write, store, motor_inertia, seconds)
     console = _console(as_json)
+    if plan_only:
+        _show_plan(machine, options, console, as_json)
+        return
     with _stop_key() as key, TerminalScreen(console, _may_move(yes)) as screen:
         result = workflow.run(
             machine,
@@ -241,7 +267,7 @@ def run(
 
 @app.command()
 def demo(
-    plan: Plan = "classic",
+    plan: Plan = "fast",
     write: Annotated[
         bool, typer.Option("--write/--no-write", help="Write the new parameters into the drives.")
     ] = True,
@@ -249,32 +275,48 @@ def demo(
     machine: Annotated[
         str, typer.Option("--machine", help="Another packaged simulated machine.")
     ] = "paper-3x3",
+    seconds: Seconds = None,
     out: Out = None,
     as_json: Json = False,
 ) -> None:
     """Do the whole job on the packaged simulated machine: no hardware, no arguments."""
-    run(machine, plan, write, True, store, "measured", out, as_json)
+    run(machine, plan, write, True, store, "measured", seconds, False, out, as_json)
 
 
 @app.command()
 def measure(
     machine: Machine,
-    plan: Plan = "classic",
+    plan: Plan = "fast",
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask before moving.")] = False,
+    seconds: Seconds = None,
+    plan_only: PlanOnly = False,
     out: Out = None,
     as_json: Json = False,
 ) -> None:
     """MOVES THE MACHINE. Measure only; the recording is in the session folder."""
-    _options(plan, False, False, "measured")
+    options = _options(plan, False, False, "measured", seconds)
     console = _console(as_json)
+    if plan_only:
+        _show_plan(machine, options, console, as_json)
+        return
     folder = _folder(out, machine)
     with _stop_key() as key, TerminalScreen(console, _may_move(yes)) as screen:
         seconds = workflow.measure(
-            machine, folder, screen=_StoppableScreen(screen, key), stop_requested=key
+            machine, folder, options, screen=_StoppableScreen(screen, key), stop_requested=key
         )
     console.print(f"{seconds:.0f} s of machine time; the recording is in {folder}")
     if as_json:
         _print_json({"folder": str(folder), "time": {"machine_s": seconds}})
+
+
+def _show_plan(machine: str, options: workflow.Options, console: Console, as_json: bool) -> None:
+    """Show the fast plan for a machine; nothing moves."""
+    if options.plan != "fast":
+        raise typer.BadParameter("--plan-only is for the fast plan")
+    with TerminalScreen(console) as screen:
+        planned = workflow.plan(machine, options, screen=screen)
+    if as_json:
+        _print_json(planned.as_dict())
 
 
 @app.command()
@@ -284,20 +326,40 @@ def identify(
         list[str] | None, typer.Option("--masses", help="Chain length, as AXIS=N; may be repeated.")
     ] = None,
     motor_inertia: Motor = "measured",
+    seconds: Seconds = None,
+    plan_only: Annotated[
+        bool,
+        typer.Option("--plan-only", help="Show what the next measurement should be, as well."),
+    ] = False,
+    picture: Annotated[
+        Path | None,
+        typer.Option("--picture", help="Draw measured and modelled response (FILE.png)."),
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Identify masses, springs, couplings and dampers from a recording."""
     console = _console(as_json)
-    options = _options("classic", False, False, motor_inertia)
-    found = workflow.identify(source, options, _lengths(masses or []))
+    options = _options("fast", False, False, motor_inertia, seconds)
+    planned = None
+    if plan_only:
+        found, planned = workflow.next_plan(source, options, _lengths(masses or []))
+    else:
+        found = workflow.identify(source, options, _lengths(masses or []))
+    if picture is not None:
+        workflow.draw(found, picture)
     console.print(model_table(found.model, None, found.torque_units))
     if found.chain is not None:
         for line in found.chain.sentences:
             console.print(f"  {line}")
     for note in found.notes:
-        console.print(f"  {note}")
+        console.print(Text(f"  {note}"))
+    if planned is not None:
+        with TerminalScreen(console) as screen:
+            screen.stage("What the next measurement should be")
+            screen.fast_plan(planned)
     if as_json:
-        _print_json({"model": found.model.as_dict(), "notes": list(found.notes)})
+        data = {"model": found.model.as_dict(), "notes": list(found.notes)}
+        _print_json({**data, "plan": planned.as_dict()} if planned is not None else data)
 
 
 @app.command()

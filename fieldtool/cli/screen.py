@@ -5,6 +5,7 @@ from time import perf_counter
 from types import TracebackType
 from typing import Any
 
+import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, ProgressColumn, Task, TextColumn
 from rich.progress import Progress as Bar
@@ -13,10 +14,13 @@ from rich.text import Text
 
 from fieldtool.design.tuning import Tuning
 from fieldtool.experiment.forecast import AxisForecast
+from fieldtool.experiment.multisine_runner import MultisineProgress
 from fieldtool.experiment.plan import SweepPlan
 from fieldtool.experiment.runner import Progress
+from fieldtool.identify.expected import Expected
 from fieldtool.records.model import Estimate, Kind, MachineModel
 from fieldtool.workflow import SessionResult, parameter_table
+from fieldtool.workflow.planning import PlannedFast
 from fieldtool.writeback.transaction import WriteBack
 
 UNITS = {
@@ -34,6 +38,8 @@ UNITS = {
 Ask = Callable[[str], bool]
 WIDE = 110
 """Columns that the table with the drives' own units needs."""
+PACE_FROM = 0.03
+"""Share done from which the pace says how long the rest will take."""
 QUIET_INTERVAL = 5.0
 """Seconds between progress lines where there is no terminal."""
 
@@ -45,7 +51,7 @@ class _Left(ProgressColumn):
         """Return e.g. ``1 min 20 s left``."""
         if task.finished:
             return Text(f"{_clock(task.elapsed or 0)} taken")
-        if not task.completed or not task.elapsed:
+        if task.completed < PACE_FROM or not task.elapsed:
             return Text("measuring the pace")
         left = task.elapsed * (1 - task.completed) / task.completed
         return Text(f"{_clock(left)} left")
@@ -97,6 +103,42 @@ class TerminalScreen:
                 f"{min(tones):.2f} - {max(tones):.2f}",
             )
         self.console.print(sweeps)
+        self._show_moves(expected)
+        self.console.print(
+            f"  Simulated with the prior model: every limit is kept. About {_clock(duration)} of "
+            f"machine time, a cycle of {plan.cycle_time * 1000:g} ms."
+        )
+
+    def fast_plan(self, planned: PlannedFast) -> None:
+        """Show what will move, how far, for how long, and how well it will tell."""
+        self._close()
+        table = Table(box=None, padding=(0, 2))
+        for title in ("part", "experiments", "lines", "Hz", "period", "time"):
+            table.add_column(title)
+        for name, plan in (("pilot, weak", planned.pilot), ("main", planned.plan)):
+            if plan is not None:
+                f = plan.frequencies
+                first = plan.experiments[0]
+                _add(
+                    table,
+                    name,
+                    f"{len(plan.experiments)}, all axes at once",
+                    f"{f.size} odd, {first.detection.size} left out",
+                    f"{f[0]:.2f} - {f[-1]:.2f}",
+                    f"{first.period:.2f} s, {first.periods} times",
+                    _clock(plan.duration),
+                )
+        self.console.print(table)
+        self._show_moves(planned.moves)
+        rests_on = "machine as last accepted" if planned.pilot else "pilot's model"
+        self.console.print(
+            f"  Simulated with the {rests_on}: every limit is kept. {_clock(planned.duration)} of "
+            f"excitation, a cycle of {planned.plan.cycle_time * 1000:g} ms; all axes stay under "
+            "position control."
+        )
+        self.console.print(Text("  " + expected_text(planned.accuracy)))
+
+    def _show_moves(self, expected: Sequence[AxisForecast]) -> None:
         peaks = Table(box=None, padding=(0, 2))
         for title in ("axis", "moves at most", "speed", "torque", "following error"):
             peaks.add_column(title)
@@ -110,12 +152,8 @@ class TerminalScreen:
                 f"{axis.following_error:.3g} {UNITS[axis.kind]['position']}",
             )
         self.console.print(peaks)
-        self.console.print(
-            f"  Simulated with the prior model: every limit is kept. About {_clock(duration)} of "
-            f"machine time, a cycle of {plan.cycle_time * 1000:g} ms."
-        )
 
-    def progress(self, progress: Progress) -> None:
+    def progress(self, progress: Progress | MultisineProgress) -> None:
         """Move the bar."""
         if self._bar is None:
             self._bar = Bar(
@@ -133,10 +171,7 @@ class TerminalScreen:
         self._bar.update(
             self._task,
             completed=progress.done,
-            description=(
-                f"sweep {progress.sweep}/{progress.sweeps}: {progress.name}, "
-                f"{progress.frequency:.2f} Hz"
-            ),
+            description=_what_runs(progress),
         )
         if not self.console.is_terminal and perf_counter() - self._last_shown > QUIET_INTERVAL:
             self._last_shown = perf_counter()
@@ -168,6 +203,30 @@ class TerminalScreen:
         if self._bar is not None:
             self._bar.stop()
             self._bar = None
+
+
+def _what_runs(progress: Progress | MultisineProgress) -> str:
+    """Return what is being measured now."""
+    if isinstance(progress, Progress):
+        where = f"sweep {progress.sweep}/{progress.sweeps}"
+        return f"{where}: {progress.name}, {progress.frequency:.2f} Hz"
+    part = f"period {progress.period} of {progress.periods}" if progress.period else "run-in"
+    return f"experiment {progress.experiment}/{progress.experiments}: {progress.name}, {part}"
+
+
+def expected_text(expected: Expected) -> str:
+    """Return the accuracy to expect as one sentence: the worst of each kind, 95 %."""
+    parts = [
+        f"{plural} within {percent:.2g} %"
+        for kind, plural in (
+            ("mass", "masses"),
+            ("spring", "springs"),
+            ("coupling", "couplings"),
+            ("damper", "dampers"),
+        )
+        if 0 < (percent := 196 * expected.relative(kind)) < np.inf
+    ]
+    return f"To expect (95 %): {', '.join(parts)}." if parts else "To expect: nothing is told."
 
 
 def _add(table: Table, *cells: str, style: str = "") -> None:

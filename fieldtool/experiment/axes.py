@@ -25,9 +25,9 @@ class Mover(Protocol):
     """Gives enabled axes: ``CanopenGroup`` does."""
 
     def motion(
-        self, cycle_time: float, free: tuple[str, ...] = ()
+        self, cycle_time: float, free: tuple[str, ...] = (), torque_offset: bool = False
     ) -> AbstractContextManager[Motion]:
-        """Enable all axes; those in ``free`` float."""
+        """Enable all axes; those in ``free`` float; torque offsets can be streamed if asked for."""
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from drives.api import AxisLimits
 from fieldtool.errors import PlanRefusedError
@@ -11,6 +12,7 @@ from fieldtool.experiment.plan import Sweep, SweepPlan, tone_blocks, transition
 from fieldtool.records.closed_loop import AxisLoop, ClosedLoop
 from fieldtool.records.model import FloatArray, Kind, MachineModel
 
+BoolArray = NDArray[np.bool_]
 SIMULATED_BLOCKS = 3
 """Blocks of each tone in the simulation; transients have their largest values before that."""
 
@@ -62,7 +64,7 @@ def forecast(plan: SweepPlan, setting: Setting) -> tuple[AxisForecast, ...]:
     peaks = np.zeros((5, len(setting.loops)))
     for sweep in plan.sweeps:
         found = _sweep_peaks(sweep, plan.cycle_time, setting)
-        _check(sweep, found, setting)
+        check_peaks(f"sweep {sweep.name}", found, setting)
         peaks = np.maximum(peaks, found)
     return tuple(
         AxisForecast(axis.name, axis.kind, *(float(v) for v in peaks[:, k]))
@@ -88,10 +90,31 @@ def _sweep_peaks(sweep: Sweep, step: float, setting: Setting) -> FloatArray:
     references = np.zeros((sum(p.size for p in pieces), len(setting.loops)))
     references[:, axis] = np.concatenate(pieces)
     position, torque = loop.simulate(references, step)
+    held = np.array([one is not None for one in loop.loops])
+    return largest_values(references, position, torque, step, held)
+
+
+def largest_values(
+    references: FloatArray, position: FloatArray, torque: FloatArray, step: float, held: BoolArray
+) -> FloatArray:
+    """Return the largest excursions, velocities, accelerations, torques and following errors.
+
+    Parameters
+    ----------
+    references, position, torque
+        Simulated, shape (n, M), relative to the centre, at the ``step`` in seconds.
+    step
+        Seconds.
+    held
+        Which axes follow their reference, shape (M,); the others have no following error.
+
+    Returns
+    -------
+    ndarray
+        Shape (5, M), SI.
+    """
     velocity = np.gradient(position, step, axis=0)
-    held = [k for k, one in enumerate(loop.loops) if one is not None]
-    error = np.zeros(len(setting.loops))
-    error[held] = np.abs(references - position)[:, held].max(axis=0)
+    error = np.where(held, np.abs(references - position).max(axis=0), 0.0)
     return np.stack(
         [
             np.abs(position).max(axis=0),
@@ -103,7 +126,23 @@ def _sweep_peaks(sweep: Sweep, step: float, setting: Setting) -> FloatArray:
     )
 
 
-def _check(sweep: Sweep, peaks: FloatArray, setting: Setting) -> None:
+def check_peaks(what_moves: str, peaks: FloatArray, setting: Setting) -> None:
+    """See that no limit is left.
+
+    Parameters
+    ----------
+    what_moves
+        Sweep or experiment with its name, for the message.
+    peaks
+        Largest excursions, velocities, accelerations, torques and following errors, shape (5, M).
+    setting
+        Axes, limits and centres.
+
+    Raises
+    ------
+    PlanRefusedError
+        Naming axis, value and limit.
+    """
     for k, (name, limits) in enumerate(zip(setting.model.names, setting.limits, strict=True)):
         room = min(setting.centre[k] - limits.travel[0], limits.travel[1] - setting.centre[k])
         unit = "rad" if setting.model.axes[k].kind == "rotary" else "m"
@@ -117,7 +156,7 @@ def _check(sweep: Sweep, peaks: FloatArray, setting: Setting) -> None:
         ):
             if value > limit:
                 raise PlanRefusedError(
-                    f"sweep {sweep.name}: {name} would {what} {value:.4g} {in_unit}, its limit is "
+                    f"{what_moves}: {name} would {what} {value:.4g} {in_unit}, its limit is "
                     f"{limit:.4g} {in_unit}. Nothing was moved. Widen the limit if the machine allows "
                     "it, or correct the prior model."
                 )

@@ -1,9 +1,10 @@
-"""What a drive's interpolation of cyclic targets adds to the torque where it is sampled.
+"""What a drive's handling of cyclic targets adds to the torque where it is sampled.
 
-A drive that goes straight from target to target bends its reference at every SYNC.  At the SYNCs
-the reference r lies on the wanted sine, between them it lies (w^2 r / 2) t (T - t) below it, on
-average (w T)^2 r / 12.  The axis follows the average, but the loop's torque shows the bends, and is
-sampled always at the same place: just after a bend, by the lag d of the torque.  So
+Position targets: a drive that goes straight from target to target bends its reference at every
+SYNC.  At the SYNCs the reference r lies on the wanted sine, between them it lies (w^2 r / 2) t
+(T - t) below it, on average (w T)^2 r / 12.  The axis follows the average, but the loop's torque
+shows the bends, and is sampled always at the same place: just after a bend, by the lag d of the
+torque.  So
 
     velocity_p position_p r (w T)^2 / 12 (1 - 6 (d / T) (1 - d / T))
 
@@ -12,10 +13,13 @@ and reference; masses and springs come out 0.13 % too large without it.
 
 Valid for: T short against the velocity loop's response (velocity_p T well below the motor's mass),
 feed-forward off, no low-pass near the SYNC rate, d below T.
+
+Torque offsets are held from SYNC to SYNC; see :func:`held_offset`.
 """
 
 import numpy as np
 
+from fieldtool.frf.phasors import ComplexArray, FloatArray
 from fieldtool.records.recorded import Experiment, Recording, Segment
 
 LINEAR_TARGETS = "linear_targets"
@@ -31,27 +35,104 @@ def folded_torque(
     0 where the recording does not say that the drive interpolates linearly, or lacks the controller
     or the reference.
     """
-    information = recording.axes[axis]
-    lag = _lags(recording).get(information.name)
-    controller, reference = information.controller, experiment.position_reference
-    if lag is None or controller is None or reference is None:
+    reference = experiment.position_reference
+    if reference is None or recording.axes[axis].name not in lags(recording):
         return 0j
     rows = slice(segment.start, segment.stop)
-    period = recording.sample_period
     omega = 2 * np.pi * segment.frequency
     time = experiment.time[rows] - experiment.time[segment.start]
     target = reference[rows, axis] - reference[rows, axis].mean()
-    phasor = 2 / target.size * complex(np.exp(-1j * omega * time) @ target)
-    # A target sent with one SYNC is reached at the next one.
-    reached = phasor * np.exp(-1j * omega * period)
-    place = min(lag / period, 1.0)
-    lost = (omega * period) ** 2 / 12 * (1 - 6 * place * (1 - place))
-    return complex(controller.velocity_p * controller.position_p * reached * lost)
+    phasors = np.zeros((1, len(recording.axes)), dtype=np.complex128)
+    phasors[0, axis] = 2 / target.size * complex(np.exp(-1j * omega * time) @ target)
+    return complex(folded_phasors(recording, np.array([segment.frequency]), phasors)[0, axis])
 
 
-def _lags(recording: Recording) -> dict[str, float]:
-    lags = {}
+def folded_phasors(
+    recording: Recording, frequencies: FloatArray, reference: ComplexArray
+) -> ComplexArray:
+    """Return the part of sampled torque phasors that is folded images, for all axes at once.
+
+    Parameters
+    ----------
+    recording
+        Says which drives interpolate linearly, and their controllers.
+    frequencies
+        (L,), Hz.
+    reference
+        (L, M): phasors of the position references as recorded, rad or m; 0 where there is none.
+
+    Returns
+    -------
+    ndarray
+        (L, M), N m or N: to be taken off the torque's phasors; 0 for axes that the recording says
+        nothing of.
+    """
+    period = recording.sample_period
+    omega = 2 * np.pi * frequencies
+    folded = np.zeros(reference.shape, dtype=np.complex128)
+    for axis, information in enumerate(recording.axes):
+        lag, controller = lags(recording).get(information.name), information.controller
+        if lag is None or controller is None:
+            continue
+        # A target sent with one SYNC is reached at the next one.
+        reached = reference[:, axis] * np.exp(-1j * omega * period)
+        place = min(lag / period, 1.0)
+        lost = (omega * period) ** 2 / 12 * (1 - 6 * place * (1 - place))
+        folded[:, axis] = controller.velocity_p * controller.position_p * reached * lost
+    return folded
+
+
+def held_offset(
+    frequencies: FloatArray, offset: ComplexArray, period: float, sampled: float, rows: int = 1
+) -> ComplexArray:
+    """Return what has to be added to sampled torque phasors because torque offsets are held.
+
+    A torque offset sent once a SYNC is a staircase o(t): constant for T from the instant at which
+    it takes effect.  Let the torque be sampled a time a after that instant (0 <= a <= T).  The
+    sample then holds the stair's own value, so its phasor is that of the sent values,
+    O exp(-j w rows T).  The staircase's component at w is that of its mean with the sine over one
+    hold: a stair that begins at -a about the sample has
+
+        (1 / T) integral from -a to T - a of exp(-j w t) dt = sinc(w T / 2) exp(-j w T / 2) exp(j w a)
+
+    with sinc(x) = sin(x) / x.  The machine answers to the component, so the difference is added:
+    O exp(-j w rows T) (sinc(w T / 2) exp(-j w (T / 2 - a)) - 1).  For a = T / 2 only the sinc is left.
+
+    Parameters
+    ----------
+    frequencies
+        (L,), Hz.
+    offset
+        (L, M): phasors of the offsets as recorded, N m or N; 0 where there is none.
+    period
+        T, s.
+    sampled
+        a, s.  With a lag d of the torque behind the SYNC, a sample taken at the SYNC sees the stair
+        before it, so a = T - d, and the value counts one row more.
+    rows
+        From the row in which an offset is recorded to the row in whose torque it shows first.
+
+    Returns
+    -------
+    ndarray
+        (L, M), N m or N.
+
+    Notes
+    -----
+    Valid for: a torque that follows the offset within a time short against T (d taken care of
+    above), and the machine's images beyond the SYNC rate too small to matter.
+    """
+    omega = 2 * np.pi * frequencies[:, None]
+    held = offset * np.exp(-1j * omega * rows * period)
+    mean = np.sinc(omega * period / (2 * np.pi)) * np.exp(-1j * omega * (period / 2 - sampled))
+    correction: ComplexArray = held * (mean - 1)
+    return correction
+
+
+def lags(recording: Recording) -> dict[str, float]:
+    """Return the torque's lag, s, of the axes whose drives interpolate linearly, by name."""
+    found = {}
     for item in str(recording.source.get(LINEAR_TARGETS, "")).split():
         name, _, lag = item.rpartition("=")
-        lags[name] = float(lag)
-    return lags
+        found[name] = float(lag)
+    return found

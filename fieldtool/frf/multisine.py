@@ -172,7 +172,7 @@ def _distortion(
         return None
     f = average.frequencies
     response = average.mean[places, position] / average.mean[places, torque]
-    predicted = _between_lines(f[places], response, f[between])
+    predicted = between_lines(f[places], response, f[between])
     explained = predicted * average.mean[between, torque]
     return Distortion(
         axis=axis,
@@ -186,27 +186,50 @@ def _distortion(
     )
 
 
-def _between_lines(
+def between_lines(
     measured_at: FloatArray, response: ComplexArray, wanted: FloatArray
 ) -> ComplexArray:
-    """Interpolate a response (L,) by a local rational function (a0 + a1 x) / (1 + b1 x).
+    """Interpolate responses (L, ...) by local rational functions (a0 + a1 x) / (1 + b1 x).
 
-    Six nearest lines, three unknowns, least squares: follows one resonance or antiresonance.
-    The apparent mass's w^2 is taken out first, so that a rigid body is a constant.
+    Six nearest lines, least squares, one b1 for all elements (each over its own size): follows one
+    resonance or antiresonance.  The apparent mass's w^2 is taken out first, so that a rigid body is
+    a constant.
+
+    Parameters
+    ----------
+    measured_at
+        (L,), Hz.
+    response
+        (L, ...): one element or a matrix at each.
+    wanted
+        (U,), Hz.
+
+    Returns
+    -------
+    ndarray
+        (U, ...).
     """
-    flat = response * measured_at**2
-    result = np.empty(wanted.size, dtype=np.complex128)
+    flat = response.reshape(measured_at.size, -1) * measured_at[:, None] ** 2
+    result = np.empty((wanted.size, flat.shape[1]), dtype=np.complex128)
     count = min(_NEIGHBOURS, measured_at.size)
     for place, frequency in enumerate(wanted):
         near = np.argsort(np.abs(measured_at - frequency), kind="stable")[:count]
         x = measured_at[near] - frequency
         x = x / np.max(np.abs(x))
-        y = flat[near]
-        A = np.column_stack([np.ones_like(x), x, -x * y])
-        solution, *_ = np.linalg.lstsq(A, y, rcond=None)
+        y = flat[near]  # (count, elements)
+        line = np.column_stack([np.ones_like(x), x])
+        Q, _ = np.linalg.qr(line)
+        size = np.sqrt(np.mean(np.abs(y) ** 2, axis=0))
+        scaled_y = y / np.where(size > 0, size, 1.0)
+        slope = x[:, None] * scaled_y
+        slope_left = slope - Q @ (Q.T @ slope)
+        y_left = scaled_y - Q @ (Q.T @ scaled_y)
+        power = float(np.sum(np.abs(slope_left) ** 2))
+        b1 = -np.sum(slope_left.conj() * y_left) / power if power > 0 else 0.0
+        solution, *_ = np.linalg.lstsq(line, y * (1 + b1 * x)[:, None], rcond=None)
         result[place] = solution[0]
-    scaled: ComplexArray = result / wanted**2
-    return scaled
+    scaled: ComplexArray = result / wanted[:, None] ** 2
+    return scaled.reshape(wanted.size, *response.shape[1:])
 
 
 def _rms(values: FloatArray) -> float:

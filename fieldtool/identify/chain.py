@@ -40,6 +40,7 @@ class ChainResult:
     """Share of the response that the model can not explain."""
     response: FrequencyResponse
     notes: tuple[str, ...]
+    fitted: RefinedModel
 
     @property
     def sentences(self) -> tuple[str, ...]:
@@ -96,6 +97,7 @@ def identify_chain(recording: Recording, masses: int) -> ChainResult:
         model_error=share,
         response=response,
         notes=tuple(notes),
+        fitted=fitted,
     )
 
 

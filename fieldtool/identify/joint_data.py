@@ -8,6 +8,7 @@ errors-in-variables likelihood of Pintelon and Schoukens, System Identification,
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,6 +61,16 @@ class JointSpectra:
 
     def _whitening(self, floor: float) -> ComplexArray:
         """Matrices W with W C W^H = 2: parts have variance 1, shape (R, M, M)."""
+        kept: dict[float, ComplexArray] = self._whitenings
+        if floor not in kept:
+            kept[floor] = self._whitened(floor)
+        return kept[floor]
+
+    @cached_property
+    def _whitenings(self) -> dict[float, ComplexArray]:
+        return {}
+
+    def _whitened(self, floor: float) -> ComplexArray:
         covariance = self.covariance
         if floor:
             size = np.linalg.norm(self.position, axis=1)

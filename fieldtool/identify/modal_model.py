@@ -9,10 +9,12 @@ springs (all masses pass their rest position together); otherwise it is small, a
 those of the undamped machine up to its square.
 
 Motor friction couples vibration to the rigid body: to first order it takes X / s from G, with
-X = R0 F Y + Y F R0 and Y = sum_r phi_r phi_r' / w_r**2, and makes sum_r Q_r / w_r = X.
+X = R0 F Y + Y F R0 and Y = sum_r phi_r phi_r' / w_r**2, and makes sum_r Q_r / w_r = X.  Where
+friction acts at loads too, X is not known from F; then that sum itself is X.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,19 +40,21 @@ class ModalParts:
     """Whether modes may be out of phase (chi)."""
     friction: bool
     delay: bool
+    load_friction: bool = False
+    """Whether friction may also act at other masses than the motors'; only with `friction`."""
 
     @property
     def axes(self) -> int:
         """M."""
         return int(self.pairs.shape[0])
 
-    @property
+    @cached_property
     def upper(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Rows and columns of R0 that are parameters."""
         i, j = np.nonzero(np.triu(self.pairs))
         return i, j
 
-    @property
+    @cached_property
     def slices(self) -> dict[str, slice]:
         """Where each part stands."""
         shape = self.axes * self.modes
@@ -184,7 +188,8 @@ def modal_response(parts: ModalParts, x: FloatArray, omega: FloatArray) -> Compl
     )
     response: ComplexArray = _rigid(v, omega) + flexible
     if parts.general and parts.friction:
-        response = response - friction_share(v) / s[:, :, None]
+        share = shape.start_velocity if parts.load_friction else friction_share(v)
+        response = response - share / s[:, :, None]
     return response * np.exp(-s * v.delays)[:, None, :]
 
 
@@ -221,6 +226,23 @@ def friction_share_derivatives(parts: ModalParts, v: ModalValues) -> FloatArray:
     return np.asarray(half + half.transpose(1, 0, 2), dtype=np.float64)
 
 
+def start_velocity_derivatives(parts: ModalParts, v: ModalValues) -> FloatArray:
+    """Derivatives of sum_r Q_r / (w_r sqrt(1 - zeta_r**2)) by every parameter, shape (M, M, P)."""
+    at, damped = parts.slices, v.omega * _root(v.zeta)
+    products = (v.phi[:, None] * v.chi[None] + v.chi[:, None] * v.phi[None]) / damped
+    result = np.zeros((parts.axes, parts.axes, parts.count))
+    result[..., at["omega"]] = -products / v.omega
+    result[..., at["zeta"]] = products * v.zeta / _root(v.zeta) ** 2
+    for a in range(parts.axes):
+        for name, other in (("phi", v.chi), ("chi", v.phi)):
+            columns = slice(
+                at[name].start + a * parts.modes, at[name].start + (a + 1) * parts.modes
+            )
+            result[a, :, columns] += other / damped
+            result[:, a, columns] += other / damped
+    return result
+
+
 class _ModeShapes:
     """Factors of the modes at s, shape (F, 1)."""
 
@@ -231,6 +253,11 @@ class _ModeShapes:
         phi, chi = v.phi, v.chi
         self.in_phase = phi[:, None] * phi[None] - chi[:, None] * chi[None]
         self.out_of_phase = phi[:, None] * chi[None] + chi[:, None] * phi[None]
+
+    @property
+    def start_velocity(self) -> FloatArray:
+        """sum_r Q_r / (w_r sqrt(1 - zeta_r**2)), shape (M, M)."""
+        return np.asarray((self.out_of_phase / self.damped).sum(axis=2), dtype=np.float64)
 
 
 def _rigid(v: ModalValues, omega: FloatArray) -> ComplexArray:
@@ -253,7 +280,10 @@ def modal_derivatives(parts: ModalParts, x: FloatArray, omega: FloatArray) -> Co
     _by_shapes(derivatives, parts, v, shape)
     _by_rigid(derivatives, parts, v, omega)
     if parts.general and parts.friction:
-        derivatives -= friction_share_derivatives(parts, v) / s[:, :, None, None]
+        share = (start_velocity_derivatives if parts.load_friction else friction_share_derivatives)(
+            parts, v
+        )
+        derivatives -= share / s[:, :, None, None]
     derivatives *= np.exp(-s * v.delays)[:, None, :, None]
     if parts.delay:
         response = modal_response(parts, x, omega)

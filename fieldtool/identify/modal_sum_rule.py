@@ -23,8 +23,11 @@ ACCURACY = 1e-3
 
 
 def sum_rule(parts: ModalParts, x: FloatArray) -> FloatArray:
-    """Residuals of the relations, one per measured pair of axes; none where chi is 0."""
-    if not parts.general:
+    """Residuals of the relations, one per measured pair of axes.
+
+    None where they hold by themselves: chi is 0, or X is not known as friction acts at loads too.
+    """
+    if not parts.general or parts.load_friction:
         return np.zeros(0)
     v = take_apart(parts, x)
     i, j = parts.upper
@@ -37,7 +40,7 @@ def sum_rule(parts: ModalParts, x: FloatArray) -> FloatArray:
 
 def sum_rule_jacobian(parts: ModalParts, x: FloatArray) -> FloatArray:
     """Derivatives of :func:`sum_rule`; the sizes are taken as fixed."""
-    if not parts.general:
+    if not parts.general or parts.load_friction:
         return np.zeros((0, parts.count))
     v = take_apart(parts, x)
     i, j = parts.upper

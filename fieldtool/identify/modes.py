@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.linalg import eig
 
 from fieldtool.errors import NotEnoughDataError
-from fieldtool.identify.least_squares import Fit, fit
+from fieldtool.identify.least_squares import Fit, damped_fit
 from fieldtool.identify.modal_model import (
     ModalModel,
     ModalParts,
@@ -46,6 +46,7 @@ def fit_modes(
     general: bool = True,
     fit_friction: bool = False,
     fit_delay: bool = False,
+    fit_load_friction: bool = False,
     prior: MachineModel | None = None,
 ) -> ModalModel:
     """Fit `modes` common vibration modes and a rigid body.
@@ -63,6 +64,8 @@ def fit_modes(
         Fit viscous friction of the rigid body; needs every pair of axes measured.
     fit_delay : bool
         Fit a delay per axis.
+    fit_load_friction : bool
+        With `fit_friction` and `general`: friction may act at loads too.
     prior : MachineModel, optional
         Its poles are tried first.
 
@@ -79,23 +82,24 @@ def fit_modes(
             f"friction needs every pair of axes, {data.names[i]} - {data.names[j]} was not "
             "measured; measure it, or fit without friction"
         )
-    parts = ModalParts(modes, data.pairs, general, fit_friction, fit_delay)
+    loads = fit_load_friction and fit_friction and general
+    parts = ModalParts(modes, data.pairs, general, fit_friction, fit_delay, loads)
     if data.count < parts.count:
         raise NotEnoughDataError(
             f"{data.count} measured numbers can not give {modes} modes "
             f"({parts.count} parameters); measure more frequencies"
         )
-    delays = _first_delays(data) if fit_delay else np.zeros(len(data.names))
+    delays = first_delays(data) if fit_delay else np.zeros(len(data.names))
     best: Fit | None = None
     for start in _tried_starts(data, parts, delays, prior):
-        found = _fit_from(data, parts, start, FINE, 60)
+        found = fit_from(data, parts, start, FINE, 60)
         if best is None or found.chi2 < best.chi2:
             best = found
         if best.excess < GOOD_ENOUGH:
             break
     if best is None:
         raise NotEnoughDataError("no start for the fit could be found; measure more frequencies")
-    return _model(data, parts, best)
+    return sorted_model(data, parts, best)
 
 
 def _tried_starts(
@@ -104,7 +108,7 @@ def _tried_starts(
     """Parameter vectors after a coarse fit, best first; the first that is good ends the search."""
     tried: list[tuple[float, FloatArray]] = []
     for poles in _starts(data, parts.modes, delays, parts.friction, prior):
-        coarse = _fit_from(data, parts, _first_guess(data, parts, poles, delays), COARSE, 15)
+        coarse = fit_from(data, parts, first_guess(data, parts, poles, delays), COARSE, 15)
         tried.append((coarse.chi2, coarse.x))
         if coarse.excess < GOOD_ENOUGH:
             break
@@ -123,8 +127,8 @@ def _starts(
         yield np.zeros(0, complex)
         return
     if prior is not None:
-        yield _prior_poles(prior, modes)
-    responses = _accelerations(data, delays)
+        yield prior_poles(prior, modes)
+    responses = accelerations(data, delays)
     for more, damping in SPREAD:
         if 2 * (modes + more) + 1 > data.omega.size:
             continue
@@ -134,7 +138,7 @@ def _starts(
             yield _most_visible(data, found, modes, delays)
 
 
-def _accelerations(data: ResponseMatrix, delays: FloatArray) -> Responses:
+def accelerations(data: ResponseMatrix, delays: FloatArray) -> Responses:
     """-w**2 G without its delays: constant plus proper fractions."""
     square = data.omega[:, None, None] ** 2
     undelayed = np.exp(1j * data.omega[:, None] * delays)[:, None, :]
@@ -146,7 +150,7 @@ def _accelerations(data: ResponseMatrix, delays: FloatArray) -> Responses:
     return Responses(data.omega, values.reshape(count, -1)[:, used], flat[:, used])
 
 
-def _prior_poles(prior: MachineModel, modes: int) -> ComplexArray:
+def prior_poles(prior: MachineModel, modes: int) -> ComplexArray:
     """Poles of a prior model; 1 % damping where it has none."""
     n = prior.mass_matrix.shape[0]
     zero, unit = np.zeros((n, n)), np.eye(n)
@@ -168,18 +172,29 @@ def _most_visible(
     """Of more poles than asked for, those that rise highest above the noise."""
     if found.pairs.size == modes:
         return found.pairs
+    height = visibility(data, found, delays)
+    kept: ComplexArray = found.pairs[np.sort(np.argsort(-height)[:modes])]
+    return kept
+
+
+def visibility(data: ResponseMatrix, found: Poles, delays: FloatArray) -> FloatArray:
+    """Height of each pole's resonance over the noise near it, shape (n,); 0 if strongly damped."""
     residues, _ = _residues(data, found.pairs, delays)
     size, damping = np.abs(found.pairs), -found.pairs.real / np.abs(found.pairs)
     noise = np.array([_nearest_noise(data, w) for w in size])
     height = np.max(np.abs(residues), axis=(0, 1)) / (2.0 * np.maximum(damping, 1e-4) * size**2)
-    height = np.where(damping > 0.3, 0.0, height) / noise
-    kept: ComplexArray = found.pairs[np.sort(np.argsort(-height)[:modes])]
-    return kept
+    result: FloatArray = np.where(damping > 0.3, 0.0, height) / noise
+    return result
 
 
 def _nearest_noise(data: ResponseMatrix, omega: float) -> float:
     row = int(np.argmin(np.abs(data.omega - omega)))
     return float(np.min(data.std[row][data.measured[row]], initial=np.inf)) or 1.0
+
+
+def pole_residues(data: ResponseMatrix, poles: ComplexArray, delays: FloatArray) -> FloatArray:
+    """Real residue matrices of given poles by linear least squares, shape (M, M, n)."""
+    return _residues(data, poles, delays)[0]
 
 
 def _residues(
@@ -215,12 +230,12 @@ def _residues(
     return residues, rigid
 
 
-def _first_guess(
+def first_guess(
     data: ResponseMatrix, parts: ModalParts, poles: ComplexArray, delays: FloatArray
 ) -> FloatArray:
     """Parameter vector for given poles, by linear least squares."""
     residues, rigid = _residues(data, poles, delays)
-    phi = np.array([_rank_one(residues[:, :, r], parts.pairs) for r in range(poles.size)])
+    phi = np.array([rank_one(residues[:, :, r], parts.pairs) for r in range(poles.size)])
     x = np.zeros(parts.count)
     at = parts.slices
     x[at["omega"]] = np.abs(poles)
@@ -231,13 +246,15 @@ def _first_guess(
     return x
 
 
-def _fit_from(
+def fit_from(
     data: ResponseMatrix,
     parts: ModalParts,
     start: FloatArray,
     floors: tuple[float, ...],
     evaluations: int,
 ) -> Fit:
+    """Fit from a parameter vector, stage after stage of relative errors added to the noise."""
+
     def residuals(x: FloatArray, floor: float) -> FloatArray:
         response = modal_response(parts, x, data.omega)
         return np.concatenate([data.residuals(response, floor), sum_rule(parts, x)])
@@ -246,10 +263,10 @@ def _fit_from(
         derivatives = modal_derivatives(parts, x, data.omega)
         return np.vstack([data.jacobian(derivatives, floor), sum_rule_jacobian(parts, x)])
 
-    return fit(residuals, jacobian, start, floors, evaluations)
+    return damped_fit(residuals, jacobian, start, floors, evaluations)
 
 
-def _rank_one(residue: FloatArray, pairs: NDArray[np.bool_]) -> FloatArray:
+def rank_one(residue: FloatArray, pairs: NDArray[np.bool_]) -> FloatArray:
     """Mode shape whose products come near a residue matrix, shape (M,), any sign."""
     shape: FloatArray
     values, vectors = np.linalg.eigh(residue)
@@ -264,7 +281,7 @@ def _rank_one(residue: FloatArray, pairs: NDArray[np.bool_]) -> FloatArray:
     return shape
 
 
-def _first_delays(data: ResponseMatrix) -> FloatArray:
+def first_delays(data: ResponseMatrix) -> FloatArray:
     """From the slope of the drive points' phase, which without delay is 0 or pi, shape (M,)."""
     delays = np.zeros(len(data.names))
     for j in range(delays.size):
@@ -277,7 +294,7 @@ def _first_delays(data: ResponseMatrix) -> FloatArray:
     return delays
 
 
-def _model(data: ResponseMatrix, parts: ModalParts, found: Fit) -> ModalModel:
+def sorted_model(data: ResponseMatrix, parts: ModalParts, found: Fit) -> ModalModel:
     """Sort modes by frequency and take the parameter vector apart."""
     order = np.argsort(found.x[parts.slices["omega"]])
     at = parts.slices

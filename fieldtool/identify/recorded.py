@@ -10,7 +10,10 @@ from fieldtool.frf.response import FrequencyResponse
 from fieldtool.frf.stepped import stepped_responses
 from fieldtool.identify.chain import ChainResult, identify_chain
 from fieldtool.identify.classic import identify_classic
-from fieldtool.records.model import Estimate, FloatArray, MachineModel
+from fieldtool.identify.joint import identify_joint
+from fieldtool.identify.moves import identify_moves
+from fieldtool.identify.refine import RefinedModel
+from fieldtool.records.model import Estimate, FloatArray, Kind, MachineModel
 from fieldtool.records.recording import Recording
 
 
@@ -29,6 +32,8 @@ class Identified:
     """Of each axis' torque: N m, N, or A where only the motor current is known."""
     chain: ChainResult | None = None
     """Features of a single elastic axis."""
+    fitted: RefinedModel | None = None
+    """The fit with its covariance; None where the order reduction's result was kept."""
 
 
 def identify_recording(
@@ -42,9 +47,10 @@ def identify_recording(
     Parameters
     ----------
     recording
-        Stepped sines of one or more axes, or multisines of one axis.
+        Stepped sines, multisines or moves.
     masses
-        Chain length by axis; where left out, the recording's own.
+        Chain length by axis; where left out, the recording's own; where that is not known, it is
+        chosen on evidence (multisines only).
     prior
         For start values of the modes' search.
     motor_masses
@@ -63,43 +69,118 @@ def identify_recording(
             f"the recording has no axis {', '.join(sorted(unknown))}; its axes are "
             f"{', '.join(recording.names)}."
         )
-    lengths = {axis.name: masses.get(axis.name, axis.masses) for axis in recording.axes}
-    missing = [name for name, count in lengths.items() if count is None]
+    known = {
+        axis.name: count
+        for axis in recording.axes
+        if (count := masses.get(axis.name, axis.masses)) is not None
+    }
+    kinds_of_data = {e.kind for e in recording.experiments if e.complete}
+    if "stepped_sine" in kinds_of_data:
+        return _classic(recording, known, prior, motor_masses)
+    if "multisine" in kinds_of_data:
+        if len(recording.axes) == 1 and not _has_references(recording):
+            return _chain(recording, known)
+        return _joint(recording, known, prior, motor_masses)
+    if kinds_of_data & {"moves", "other"}:
+        return _moves(recording, known, prior)
+    raise NotEnoughDataError(
+        "the recording has no complete experiment to identify from: its experiments are "
+        f"{sorted({e.kind for e in recording.experiments})}. Measure with `fieldtool measure`."
+    )
+
+
+def _has_references(recording: Recording) -> bool:
+    """Whether multisines were asked for as positions, as the fast plan does."""
+    return all(
+        e.position_reference is not None and bool(np.all(np.isfinite(e.position_reference)))
+        for e in recording.experiments
+        if e.kind == "multisine"
+    )
+
+
+def _units(recording: Recording) -> tuple[str, ...]:
+    return tuple(axis.torque_unit for axis in recording.axes)
+
+
+def _kinds(recording: Recording) -> dict[str, Kind]:
+    return {axis.name: axis.kind for axis in recording.axes}
+
+
+def _check_known(recording: Recording, known: Mapping[str, int]) -> None:
+    missing = [name for name in recording.names if name not in known]
     if missing:
         raise NotEnoughDataError(
             f"the number of masses of {', '.join(missing)} is not known. Give it with --masses "
             f"{missing[0]}=2, or as `masses` of the axis in the recording."
         )
-    known = {name: count for name, count in lengths.items() if count is not None}
-    kinds = {axis.name: axis.kind for axis in recording.axes}
-    units = tuple(axis.torque_unit for axis in recording.axes)
-    kinds_of_data = {e.kind for e in recording.experiments if e.segments or e.period}
-    if "stepped_sine" in kinds_of_data:
-        stepped = stepped_responses(recording)
-        found = identify_classic(stepped, known, kinds, prior, motor_masses)
-        return Identified(
-            found.model,
-            "stepped sines, order reduction of the paper (equations 2 to 22), dampers by a fit",
-            stepped.responses,
-            found.damping_ratios,
-            found.notes,
-            units,
-        )
-    if len(recording.axes) == 1 and "multisine" in kinds_of_data:
-        chain = identify_chain(recording, known[recording.names[0]])
-        return Identified(
-            _with_delay(chain),
-            "multisine, maximum likelihood fit of masses, springs, dampers, delay and friction",
-            {chain.response.condition: chain.response},
-            np.array([ratio.value for ratio in chain.features.damping_ratios]),
-            chain.notes,
-            units,
-            chain,
-        )
-    raise NotEnoughDataError(
-        "the recording has neither settled stepped sines nor a multisine of a single axis with its "
-        f"`period`: its experiments are {sorted({e.kind for e in recording.experiments})}. Measure "
-        "with `fieldtool measure`."
+
+
+def _classic(
+    recording: Recording,
+    known: Mapping[str, int],
+    prior: MachineModel | None,
+    motor_masses: Mapping[str, Estimate] | None,
+) -> Identified:
+    _check_known(recording, known)
+    stepped = stepped_responses(recording)
+    found = identify_classic(stepped, known, _kinds(recording), prior, motor_masses)
+    return Identified(
+        found.model,
+        "stepped sines, order reduction of the paper (equations 2 to 22), dampers by a fit",
+        stepped.responses,
+        found.damping_ratios,
+        found.notes,
+        _units(recording),
+    )
+
+
+def _chain(recording: Recording, known: Mapping[str, int]) -> Identified:
+    _check_known(recording, known)
+    chain = identify_chain(recording, known[recording.names[0]])
+    return Identified(
+        _with_delay(chain),
+        "multisine, maximum likelihood fit of masses, springs, dampers, delay and friction",
+        {chain.response.condition: chain.response},
+        np.array([ratio.value for ratio in chain.features.damping_ratios]),
+        chain.notes,
+        _units(recording),
+        chain=chain,
+        fitted=chain.fitted,
+    )
+
+
+def _joint(
+    recording: Recording,
+    known: Mapping[str, int],
+    prior: MachineModel | None,
+    motor_masses: Mapping[str, Estimate] | None,
+) -> Identified:
+    found = identify_joint(recording, known, _kinds(recording), prior, motor_masses)
+    return Identified(
+        found.model,
+        "multisines of all axes, block order reduction, maximum likelihood fit of everything",
+        found.responses,
+        found.modal.zeta,
+        found.notes,
+        _units(recording),
+        fitted=found.fitted,
+    )
+
+
+def _moves(
+    recording: Recording, known: Mapping[str, int], prior: MachineModel | None
+) -> Identified:
+    _check_known(recording, known)
+    found = identify_moves(recording, known, _kinds(recording), prior)
+    responses = {} if found.response is None else {found.response.condition: found.response}
+    return Identified(
+        found.model,
+        "moves, maximum likelihood fit to the spectra of positions and torques",
+        responses,
+        np.zeros(0),
+        found.notes,
+        _units(recording),
+        fitted=found.refined,
     )
 
 

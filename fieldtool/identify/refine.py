@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fieldtool.errors import IdentificationError, NotEnoughDataError
+from fieldtool.identify.joint_data import JointSpectra
 from fieldtool.identify.least_squares import Fit, fit, standard_errors
 from fieldtool.identify.parameters import (
     Parameter,
@@ -31,6 +32,7 @@ from fieldtool.records.model import Estimate, MachineModel
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
+Measured = ResponseMatrix | JointSpectra
 FURTHEST = 12.0
 """Natural logarithm of the largest change from the start that a fit may try."""
 UNKNOWN_ABOVE = 0.5
@@ -95,7 +97,7 @@ def machine_response(
 
 def refine(
     start: MachineModel,
-    data: ResponseMatrix,
+    data: Measured,
     *,
     fixed: Collection[str] = (),
     priors: Mapping[str, Estimate] | None = None,
@@ -111,7 +113,7 @@ def refine(
     start : MachineModel
         Where to begin, e.g. from order reduction.  Its chain lengths and its list of couplings
         are kept.  Without dampers, 1 % of critical is the start.
-    data : ResponseMatrix
+    data : ResponseMatrix or JointSpectra
         Same axes in the same order.
     fixed : names
         Parameters that keep their start value.
@@ -156,7 +158,7 @@ class _Problem:
     """The fit in scaled units: x = 0 is the start, and 1 a relative change of 1."""
 
     start: MachineModel
-    data: ResponseMatrix
+    data: Measured
     parameters: tuple[Parameter, ...]
     initial: FloatArray
     free: NDArray[np.intp]
@@ -167,7 +169,7 @@ class _Problem:
     def build(
         cls,
         start: MachineModel,
-        data: ResponseMatrix,
+        data: Measured,
         fixed: set[str],
         priors: dict[str, Estimate],
         kept_kinds: set[str],

@@ -3,11 +3,11 @@
 Each axis that is not free has a cascade, as servo drives have it::
 
     e = position_p (r - q) + velocity_ff r' - q'
-    torque = filters( velocity_p e + velocity_i integral(e) + inertia_ff r'' )
+    torque = filters( velocity_p e + velocity_i integral(e) + inertia_ff r'' + offset )
 
-q is the motor's position, r its reference.  Drives run these loops at several kHz with a current
-loop of about 1 kHz; both are left out here, which holds while modes and loop bandwidths stay below
-some 100 Hz.
+q is the motor's position, r its reference, offset a torque that the host adds.  Drives run these
+loops at several kHz with a current loop of about 1 kHz; both are left out here, which holds while
+modes and loop bandwidths stay below some 100 Hz.
 """
 
 from collections.abc import Mapping, Sequence
@@ -77,6 +77,11 @@ class AxisLoop:
             gain *= complex(biquad.response(np.array([s]))[0])
         return gain
 
+    def gain_of_reference(self, s: complex) -> complex:
+        """Return torque per reference with the axis locked, at a complex frequency, rad/s."""
+        share = (self.position_p + s * self.velocity_ff) / (self.position_p + s)
+        return self.gain(s) * share + self.torque_shape(s) * self.inertia_ff * s * s
+
     def gain(self, s: complex) -> complex:
         """Return torque per position error at a complex frequency, rad/s."""
         pi = self.velocity_p + self.velocity_i / s
@@ -129,8 +134,7 @@ class ClosedLoop:
                     continue
                 gain[k] = loop.gain(s)
                 if k == axis:
-                    share = (loop.position_p + s * loop.velocity_ff) / (loop.position_p + s)
-                    drive = gain[k] * share + loop.torque_shape(s) * loop.inertia_ff * s * s
+                    drive = loop.gain_of_reference(s)
             dynamic[motors, motors] += gain
             load[motors[axis]] = drive
             q = np.linalg.solve(dynamic, load)[motors]
@@ -189,7 +193,9 @@ class ClosedLoop:
         moving = values[np.abs(values) > RIGID * scale]
         return bool(np.all(moving.real < ROUNDING * scale))
 
-    def simulate(self, references: FloatArray, step: float) -> tuple[FloatArray, FloatArray]:
+    def simulate(
+        self, references: FloatArray, step: float, torque_offset: FloatArray | None = None
+    ) -> tuple[FloatArray, FloatArray]:
         """Return motor positions and torques along sampled references, from rest.
 
         Parameters
@@ -198,6 +204,9 @@ class ClosedLoop:
             Shape (n, M), rad or m, relative to the start, linear from sample to sample.
         step
             Seconds between samples.
+        torque_offset
+            Added to the torques that the loops ask for, before their filters, shape (n, M), N m or N,
+            held from sample to sample; on a floating axis it does nothing.
 
         Returns
         -------
@@ -219,14 +228,39 @@ class ClosedLoop:
         g_v = exponential[:size, size + m : size + 2 * m]
         velocity = np.diff(references, axis=0, append=references[-1:]) / step
         forced = references @ g_r.T + velocity @ g_v.T
+        direct = np.zeros((n, m))
+        if torque_offset is not None:
+            b_t, c_t = self._offset_matrices()
+            held = np.block([[a, b_t], [np.zeros((m, size + m))]])
+            forced += torque_offset @ expm(held * step)[:size, size:].T
+            direct = torque_offset @ c_t.T
         states = np.empty((n, size))
         x = np.zeros(size)
         for k in range(n):
             states[k] = x
             x = f @ x + forced[k]
         position = states[:, self.model.first_masses]
-        torque = states @ c_x.T + references @ c_r.T + velocity @ c_v.T
+        torque = states @ c_x.T + references @ c_r.T + velocity @ c_v.T + direct
         return position, torque
+
+    def _offset_matrices(self) -> tuple[FloatArray, FloatArray]:
+        """Return B_t and C_t: what torque offsets u add to x' and to the torques."""
+        model, m = self.model, len(self.loops)
+        n = model.mass_matrix.shape[0]
+        b_t, c_t = np.zeros((self.system_matrix().shape[0], m)), np.zeros((m, m))
+        place = 2 * n
+        for k, loop in enumerate(self.loops):
+            if loop is None:
+                continue
+            place += 1
+            share = 1.0
+            for biquad in loop.filters:
+                b_t[place + 1, k] = share
+                share *= biquad.numerator[0]
+                place += 2
+            c_t[k, k] = share
+        b_t[n : 2 * n] += np.linalg.inv(model.mass_matrix)[:, model.first_masses] @ c_t
+        return b_t, c_t
 
     def _matrices(self) -> tuple[FloatArray, ...]:
         """Return A, B_r, B_v, C_x, C_r, C_v: torques are C_x x + C_r r + C_v r'.

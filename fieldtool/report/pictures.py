@@ -1,6 +1,6 @@
 """Measured and modelled responses as one PNG."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +31,7 @@ def draw_responses(
     prior: MachineModel | None,
     path: Path,
     fitted: RefinedModel | None = None,
+    torque_units: Sequence[str] = (),
 ) -> None:
     """Draw each motor's acceleration per torque of every motor: measured, model, prior model.
 
@@ -47,6 +48,8 @@ def draw_responses(
         PNG file to write.
     fitted
         Where the band comes from; none is drawn without it.
+    torque_units
+        One an axis; N m or N where left out.
 
     Raises
     ------
@@ -69,7 +72,7 @@ def draw_responses(
             _draw_measured(plot, measured, i, j)
             what = "its own torque" if i == j else f"torque of {names[j]}"
             plot.set_title(f"{names[i]}: acceleration per {what}", loc="left", fontsize=10)
-            plot.set_ylabel(_unit(model, i, j) if j == 0 else "")
+            plot.set_ylabel(_unit(model, i, j, torque_units) if j == 0 else "")
             plot.grid(visible=True, which="both", alpha=0.25)
     for plot in plots[-1]:
         plot.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
@@ -115,7 +118,7 @@ class _Curves:
                 color=MODEL,
                 alpha=0.25,
                 lw=0,
-                label="its 95 % band",
+                label="model, 95 % band",
             )
         plot.loglog(grid, size, color=MODEL, lw=1.4, label="identified model")
         shown = size[size > 0]
@@ -141,7 +144,9 @@ def _draw_measured(plot: Axes, measured: FrequencyResponse, i: int, j: int) -> N
     )
 
 
-def _unit(model: MachineModel, i: int, j: int) -> str:
+def _unit(model: MachineModel, i: int, j: int, torque_units: Sequence[str]) -> str:
+    if torque_units and torque_units[j] == "A":
+        return "rad/(A s²)" if model.axes[i].kind == "rotary" else "m/(A s²)"
     kinds = {model.axes[i].kind, model.axes[j].kind}
     if kinds == {"rotary"}:
         return "1/(kg m²)"

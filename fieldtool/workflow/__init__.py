@@ -4,7 +4,9 @@ This is the only place that knows all stages, and, with criticism, the only one 
 simulation may stand behind the bus.
 """
 
+from fieldtool.workflow.fast_measuring import plan
 from fieldtool.workflow.models import prior_model, truth_model
+from fieldtool.workflow.next_plan import next_plan
 from fieldtool.workflow.recordings import compare, export_folder, import_folder, simulate
 from fieldtool.workflow.session import (
     Options,
@@ -13,7 +15,7 @@ from fieldtool.workflow.session import (
     SessionResult,
     parameter_table,
 )
-from fieldtool.workflow.stages import identify, measure, redesign, restore, run, write
+from fieldtool.workflow.stages import draw, identify, measure, redesign, restore, run, write
 
 __all__ = [
     "Options",
@@ -21,11 +23,14 @@ __all__ = [
     "Screen",
     "SessionResult",
     "compare",
+    "draw",
     "export_folder",
     "identify",
     "import_folder",
     "measure",
+    "next_plan",
     "parameter_table",
+    "plan",
     "prior_model",
     "redesign",
     "restore",

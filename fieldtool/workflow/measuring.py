@@ -52,7 +52,7 @@ def _measure_both_passes(session: Session, group: CanopenGroup) -> float:
         raise UserStopError("not begun: nothing was moved")
     axes = axes_of(group, setting)
     with RecordingWriter(
-        folder.recording, recording_header(machine, group, cycle_time)
+        folder.recording, recording_header(machine, group, cycle_time, with_lengths=True)
     ) as recording:
 
         def keep(experiment: Experiment) -> None:

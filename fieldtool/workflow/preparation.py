@@ -23,8 +23,13 @@ def setting_of(machine: MachineProfile, group: CanopenGroup, model: MachineModel
     )
 
 
-def recording_header(machine: MachineProfile, group: CanopenGroup, cycle_time: float) -> Recording:
-    """Return a recording without experiments, with all that is known of the axes."""
+def recording_header(
+    machine: MachineProfile, group: CanopenGroup, cycle_time: float, *, with_lengths: bool
+) -> Recording:
+    """Return a recording without experiments, with all that is known of the axes.
+
+    ``with_lengths`` puts the prior model's numbers of masses into it; without, they are to be found.
+    """
     axes = []
     for axis, drive in zip(machine.axes, group.drives, strict=True):
         values = read_parameters(drive)
@@ -33,7 +38,7 @@ def recording_header(machine: MachineProfile, group: CanopenGroup, cycle_time: f
             AxisInfo(
                 name=axis.name,
                 kind=axis.kind,
-                masses=len(axis.prior.masses),
+                masses=len(axis.prior.masses) if with_lengths else None,
                 motor_inertia=axis.motor_inertia.value if axis.motor_inertia else None,
                 rated_torque=drive.rated_torque,
                 encoder_counts_per_rev=(2 * np.pi / drive.scaling.position if rotary else None),

@@ -16,15 +16,17 @@ from drives.profile import MachineProfile, load_machine
 from fieldtool.design.tuning import Tuning
 from fieldtool.errors import OutputError
 from fieldtool.experiment.forecast import AxisForecast
+from fieldtool.experiment.multisine_runner import MultisineProgress
 from fieldtool.experiment.plan import SweepPlan
 from fieldtool.experiment.runner import Progress
 from fieldtool.identify.recorded import Identified
 from fieldtool.records.model import MachineModel
 from fieldtool.records.session_folder import SessionFolder
 from fieldtool.records.yaml_file import write_yaml
+from fieldtool.workflow.planning import PlannedFast
 from fieldtool.writeback.transaction import WriteBack
 
-PlanName = Literal["classic"]
+PlanName = Literal["classic", "fast"]
 
 
 class Screen(Protocol):
@@ -39,7 +41,10 @@ class Screen(Protocol):
     def plan(self, plan: SweepPlan, expected: Sequence[AxisForecast], duration: float) -> None:
         """A plan was made and checked; nothing of it has moved yet."""
 
-    def progress(self, progress: Progress) -> None:
+    def fast_plan(self, planned: PlannedFast) -> None:
+        """A fast plan was made and checked; nothing of it has moved yet."""
+
+    def progress(self, progress: Progress | MultisineProgress) -> None:
         """A block of a sweep ended."""
 
     def ready(self) -> bool:
@@ -64,7 +69,10 @@ class Quiet:
     def plan(self, plan: SweepPlan, expected: Sequence[AxisForecast], duration: float) -> None:
         """Show nothing."""
 
-    def progress(self, progress: Progress) -> None:
+    def fast_plan(self, planned: PlannedFast) -> None:
+        """Show nothing."""
+
+    def progress(self, progress: Progress | MultisineProgress) -> None:
         """Show nothing."""
 
     def ready(self) -> bool:
@@ -82,7 +90,9 @@ class Quiet:
 class Options:
     """How a session is run."""
 
-    plan: PlanName = "classic"
+    plan: PlanName = "fast"
+    excitation_time: float | None = None
+    """Seconds of excitation that the fast plan may take; its own choice where None."""
     write: bool = False
     store: bool = False
     motor_inertia: Literal["measured", "data sheet"] = "measured"

@@ -10,7 +10,7 @@ from drives.parameters import Change, HeldObject, load_backup
 from drives.profile import MachineProfile, load_machine
 from fieldtool.design.tuning import Tuning, design
 from fieldtool.design.tuning_file import read_tuning, tuning_as_dict
-from fieldtool.errors import FileFormatError, OutputError
+from fieldtool.errors import FileFormatError, NotEnoughDataError, OutputError
 from fieldtool.frf.response import save_responses
 from fieldtool.identify.recorded import Identified, identify_recording
 from fieldtool.records.model import Estimate, MachineModel
@@ -21,6 +21,7 @@ from fieldtool.records.recording import (
 from fieldtool.records.session_folder import SessionFolder
 from fieldtool.records.yaml_file import write_yaml
 from fieldtool.report.pictures import draw_responses
+from fieldtool.workflow.fast_measuring import measured_fast
 from fieldtool.workflow.measuring import measured
 from fieldtool.workflow.models import data_sheet_masses, prior_model, truth_model
 from fieldtool.workflow.session import (
@@ -71,7 +72,7 @@ def run(
     options = options or Options()
     begin = time.perf_counter()
     with open_session(machine, out, screen, stop_requested) as (session, group):
-        machine_time = measured(session, group)
+        machine_time = _measured(session, group, options)
         if group.late_cycles:
             session.warn(
                 f"{group.late_cycles} cycles began late on this computer; the blocks with them were "
@@ -103,11 +104,12 @@ def run(
 def measure(
     machine: str | Path | MachineProfile,
     out: Path,
+    options: Options | None = None,
     *,
     screen: Screen | None = None,
     stop_requested: Callable[[], bool] = never,
 ) -> float:
-    """Run both passes of the classic plan; return the seconds of excitation.
+    """Measure with the plan that the options name; return the seconds of excitation.
 
     Raises
     ------
@@ -115,7 +117,7 @@ def measure(
         As :func:`run`.
     """
     with open_session(machine, out, screen, stop_requested) as (session, group):
-        return measured(session, group)
+        return _measured(session, group, options or Options())
 
 
 def identify(
@@ -145,6 +147,30 @@ def identify(
     if folder:
         _keep(folder, identified, prior)
     return identified
+
+
+def draw(identified: Identified, path: Path) -> None:
+    """Draw measured and modelled responses, with bands, as a PNG.
+
+    Raises
+    ------
+    NotEnoughDataError
+        If the data were moves from a prior model, without a measured response.
+    OutputError
+        If the file can not be written.
+    """
+    if not identified.responses:
+        raise NotEnoughDataError(
+            "there is no measured response to draw: the model was fitted to the moves themselves"
+        )
+    draw_responses(
+        identified.responses,
+        identified.model,
+        None,
+        path,
+        identified.fitted,
+        identified.torque_units,
+    )
 
 
 def redesign(folder_path: Path) -> Tuning:
@@ -196,6 +222,12 @@ def restore(machine: str | Path, backup: Path, store: bool = False) -> tuple[Hel
         return undo(group.drives, path, store)
 
 
+def _measured(session: Session, group: CanopenGroup, options: Options) -> float:
+    if options.plan == "fast":
+        return measured_fast(session, group, options)
+    return measured(session, group)
+
+
 def _identify(session: Session, options: Options) -> Identified:
     session.screen.stage("Identify masses, springs, couplings and dampers")
     machine = session.machine
@@ -214,7 +246,15 @@ def _identify(session: Session, options: Options) -> Identified:
 def _keep(folder: SessionFolder, identified: Identified, prior: MachineModel | None) -> None:
     save_responses(identified.responses, folder.frequency_response)
     write_model(identified.model, folder.model)
-    draw_responses(identified.responses, identified.model, prior, folder.picture)
+    if identified.responses:
+        draw_responses(
+            identified.responses,
+            identified.model,
+            prior,
+            folder.picture,
+            identified.fitted,
+            identified.torque_units,
+        )
     folder.note("identified", notes=list(identified.notes))
 
 

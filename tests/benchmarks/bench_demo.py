@@ -20,10 +20,12 @@ from drives.sim.lockstep_bus import register, unregister
 from drives.sim.machine import simulated_machine
 from fieldtool import workflow
 from fieldtool.experiment.forecast import AxisForecast
+from fieldtool.experiment.multisine_runner import MultisineProgress
 from fieldtool.experiment.plan import SweepPlan
 from fieldtool.experiment.runner import Progress
 from fieldtool.records.model import MachineModel
 from fieldtool.workflow import Options, Quiet, SessionResult
+from fieldtool.workflow.planning import PlannedFast
 
 LIMITS = {"mass": 2.0, "spring": 2.0, "coupling": 5.0}
 """Per cent."""
@@ -52,8 +54,11 @@ class Watch(Quiet):
     def plan(self, plan: SweepPlan, expected: Sequence[AxisForecast], duration: float) -> None:
         self._tell("plan")
 
-    def progress(self, progress: Progress) -> None:
-        self._tell(f"{progress.name} {progress.frequency:.2f} Hz")
+    def fast_plan(self, planned: PlannedFast) -> None:
+        self._tell("plan")
+
+    def progress(self, progress: Progress | MultisineProgress) -> None:
+        self._tell(progress.name)
         self.bar.append(self.told[-1][0])
 
     def longest_silence(self) -> tuple[float, str]:
@@ -89,7 +94,12 @@ def rows(
         yield "coupling", name, wanted_value, 100 * off / wanted_value, off / coupling.std
 
 
-def run(name: str, seed: int, folder: Path) -> tuple[SessionResult, Watch]:
+CLASSIC = Options(plan="classic", write=True)
+
+
+def run(
+    name: str, seed: int, folder: Path, options: Options = CLASSIC
+) -> tuple[SessionResult, Watch]:
     """One session on the machine of this name with this seed of its noise."""
     machine = load_machine(name)
     if machine.simulation is None:
@@ -103,7 +113,6 @@ def run(name: str, seed: int, folder: Path) -> tuple[SessionResult, Watch]:
     register(CHANNEL, simulated_machine(machine))
     watch = Watch()
     try:
-        options = Options(plan="classic", write=True)
         result = workflow.run(machine, folder, options, screen=watch, confirm=lambda _: True)
     finally:
         unregister(CHANNEL)

@@ -1,0 +1,189 @@
+"""Measure with the fast plan: a weak pilot, then the plan that it allows, all loops closed."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from drives.canopen_drive import CanopenGroup, connect
+from drives.errors import UserStopError
+from drives.profile import MachineProfile, load_machine
+from fieldtool.experiment.axes import Axes
+from fieldtool.experiment.classic import undamped_modes
+from fieldtool.experiment.directions import check_directions
+from fieldtool.experiment.fast import fast_cycle_times
+from fieldtool.experiment.multisine import MultisinePlan
+from fieldtool.experiment.multisine_forecast import experiment_peaks
+from fieldtool.experiment.multisine_runner import run_multisine
+from fieldtool.identify.expected import Noise
+from fieldtool.identify.pilot import read_pilot
+from fieldtool.records.recording import Experiment, Recording, RecordingWriter
+from fieldtool.workflow.models import prior_model
+from fieldtool.workflow.planning import (
+    PlannedFast,
+    Wanted,
+    freed_of_friction,
+    plan_main,
+    plan_pilot,
+    timing,
+    usual_seconds,
+)
+from fieldtool.workflow.preparation import axes_of, recording_header, setting_of
+from fieldtool.workflow.session import Options, Screen, Session
+from fieldtool.writeback.transaction import take_backup
+
+GUESSED_NOISE = 1e-3
+"""Of the rated torque: noise of the torque before the pilot has measured it (one count of 0x6077)."""
+LATE_SHARE = 0.01
+"""Of the pilot's cycles that may begin late; with more, the next longer cycle is tried."""
+FOLLOWING_ERROR = 4
+"""Among an experiment's peaks."""
+SEED = 20
+"""Of the random phases: the same machine gets the same plan."""
+
+
+def measured_fast(session: Session, group: CanopenGroup, options: Options) -> float:
+    """Back the parameters up, run pilot and main experiments, and return the seconds of excitation."""
+    take_backup(session.machine.name, group.drives, session.folder.parameters_before)
+    with group.without_feed_forward():
+        return _Measurement(session, group, options).run()
+
+
+def plan(
+    machine: str | Path | MachineProfile,
+    options: Options | None = None,
+    *,
+    screen: Screen | None = None,
+) -> PlannedFast:
+    """Plan a fast measurement of a machine, with its drives' gains; nothing moves.
+
+    Raises
+    ------
+    DrivesError, FieldtoolError
+        If the machine can not be reached, or no plan keeps its limits.
+    """
+    profile = machine if isinstance(machine, MachineProfile) else load_machine(machine)
+    options = options or Options()
+    with connect(profile) as group, group.without_feed_forward():
+        setting = setting_of(profile, group, prior_model(profile))
+        cycle_time = fast_cycle_times(setting.model, group.shortest_cycle)[0]
+        times = timing(setting, options.excitation_time or usual_seconds(setting.model))
+        pilot = plan_pilot(setting, cycle_time, times, SEED, group.torque_offsets)
+        main = plan_main(
+            setting,
+            cycle_time,
+            _guessed_noise(group),
+            times,
+            Wanted(),
+            SEED + 1,
+            group.torque_offsets,
+        )
+    planned = replace(main, pilot=pilot)
+    if screen is not None:
+        screen.fast_plan(planned)
+    return planned
+
+
+def _guessed_noise(group: CanopenGroup) -> Noise:
+    rated = np.array([drive.rated_torque for drive in group.drives])
+    counts = np.array([drive.scaling.position for drive in group.drives])
+    return Noise(GUESSED_NOISE * rated, counts / np.sqrt(12))
+
+
+class _Measurement:
+    """One fast measurement; what its steps share."""
+
+    def __init__(self, session: Session, group: CanopenGroup, options: Options) -> None:
+        self._session, self._group = session, group
+        self._setting = setting_of(session.machine, group, prior_model(session.machine))
+        self._cycles = fast_cycle_times(self._setting.model, group.shortest_cycle)
+        self._times = timing(
+            self._setting, options.excitation_time or usual_seconds(self._setting.model)
+        )
+        self._wanted = Wanted()
+        self._offsets = group.torque_offsets
+        self._axes: Axes = axes_of(group, self._setting)
+
+    def run(self) -> float:
+        """Return the seconds of excitation."""
+        pilot = self._plan_all(self._cycles[0])
+        if not self._session.ready():
+            raise UserStopError("not begun: nothing was moved")
+        for cycle_time in self._cycles:
+            if cycle_time != pilot.cycle_time:
+                pilot = plan_pilot(self._setting, cycle_time, self._times, SEED, self._offsets)
+            seconds = self._with_cycle(pilot, last=cycle_time == self._cycles[-1])
+            if seconds is not None:
+                return seconds
+        raise UserStopError("not begun: nothing was excited")
+
+    def _with_cycle(self, pilot: MultisinePlan, last: bool) -> float | None:
+        """Measure with the pilot's cycle; None if this computer can not keep it."""
+        session, group = self._session, self._group
+        header = recording_header(session.machine, group, pilot.cycle_time, with_lengths=False)
+        with RecordingWriter(session.folder.recording, header) as recording:
+
+            def keep(experiment: Experiment) -> None:
+                recording.append(experiment)
+                session.folder.note(
+                    "recorded", experiment=experiment.name, complete=experiment.complete
+                )
+
+            session.screen.stage("Check that every axis moves the right way")
+            late = group.late_cycles
+            check_directions(group, self._axes, pilot.cycle_time, keep)
+            rows = sum(e.samples for e in recording.recording.experiments)
+            if group.late_cycles - late > LATE_SHARE * max(rows, 1) and not last:
+                session.warn(
+                    f"{group.late_cycles - late} of {rows} cycles of {pilot.cycle_time * 1000:g} ms "
+                    "began late on this computer: the next longer cycle is tried."
+                )
+                return None
+            session.screen.stage("Measure, pilot: weak, to find noise, friction and modes")
+            seconds = self._run(pilot, keep)
+            session.screen.stage("Read the pilot, and plan the main experiments")
+            main = self._plan_after(recording.recording, pilot)
+            session.screen.stage("Measure, main experiments: all axes at once")
+            return seconds + self._run(main.plan, keep)
+
+    def _run(self, plan: MultisinePlan, keep: Callable[[Experiment], None]) -> float:
+        errors = experiment_peaks(plan, self._setting)[:, FOLLOWING_ERROR, :]
+        report = self._session.screen.progress
+        return run_multisine(self._group, plan, self._axes, keep, report, errors)
+
+    def _plan_all(self, cycle_time: float) -> MultisinePlan:
+        """Plan with the prior model, and show it; nothing has moved yet."""
+        screen = self._session.screen
+        screen.stage("Plan pilot and main experiments with the machine as last accepted")
+        pilot = plan_pilot(self._setting, cycle_time, self._times, SEED, self._offsets)
+        guess = _guessed_noise(self._group)
+        main = plan_main(
+            self._setting, cycle_time, guess, self._times, self._wanted, SEED + 1, self._offsets
+        )
+        screen.fast_plan(replace(main, pilot=pilot))
+        return pilot
+
+    def _plan_after(self, recording: Recording, pilot: MultisinePlan) -> PlannedFast:
+        """Plan the main experiments with what the pilot found."""
+        session = self._session
+        found = read_pilot(recording, self._setting.model)
+        for note in found.notes:
+            session.warn(note)
+        modes = ", ".join(f"{w / (2 * np.pi):.2f}" for w in undamped_modes(found.model)[0])
+        session.screen.say(f"Resonances found: {modes} Hz." if modes else "The axes are rigid.")
+        now_known = replace(self._setting, model=found.model)
+        main = plan_main(
+            now_known,
+            pilot.cycle_time,
+            found.noise,
+            self._times,
+            self._wanted,
+            SEED + 1,
+            self._offsets,
+        )
+        main = freed_of_friction(main, now_known, found.noise, found.friction)
+        for note in main.plan.notes:
+            session.screen.say(note)
+        session.screen.fast_plan(main)
+        return main

@@ -1,0 +1,309 @@
+"""Plan the fast measurement: how long, which lines, how strong, and how well it will tell."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from fieldtool.errors import PlanRefusedError
+from fieldtool.experiment.fast import (
+    PERIODS,
+    PILOT_SHARE,
+    SHAPES,
+    Shape,
+    experiments_for,
+    likely_torques,
+    mode_band,
+    settle_time,
+    shortest_period,
+    with_bias,
+)
+from fieldtool.experiment.forecast import AxisForecast, Setting
+from fieldtool.experiment.multisine import MultisinePlan
+from fieldtool.experiment.multisine_forecast import forecast_multisine, predicted_phasors
+from fieldtool.identify.expected import Excitation, Expected, Noise, expected_accuracy
+from fieldtool.identify.friction_left import DryFriction
+from fieldtool.identify.pilot import FRICTION_SEEN
+from fieldtool.records.model import MachineModel
+
+SECONDS, SHORTEST_SECONDS, SWINGS = 60.0, 12.0, 125.0
+"""Of excitation in all, where nothing else is asked for: so many swings of the slowest mode, in these
+bounds."""
+MULTIPLES = (1, 3, 5, 7, 9)
+"""Of the pilot's period that the main period may be: odd, so that odd lines fall on odd lines."""
+USUAL = 3
+"""Multiple that the pilot's period reckons with."""
+ROUND = 0.04
+"""Seconds that a pilot's period is a whole number of, so that it is one of all cycle times."""
+MARGIN = 2.0
+"""Standard errors that the accuracy that is wanted has to cover."""
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """Relative errors (95 %) that a measurement should stay below."""
+
+    mass: float = 0.003
+    spring: float = 0.003
+    damper: float = 0.1
+    coupling: float = 0.01
+
+    def reached(self, expected: Expected) -> float:
+        """Return the largest expected error over what is wanted; 1 or less is good."""
+        limits: dict[str, float] = vars(self)
+        return max(MARGIN * expected.relative(kind) / limit for kind, limit in limits.items())
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedFast:
+    """A plan that keeps all limits by the model that it rests on, and what it will tell."""
+
+    plan: MultisinePlan
+    moves: tuple[AxisForecast, ...]
+    accuracy: Expected
+    wanted: Wanted
+    pilot: MultisinePlan | None = None
+    """Comes before it; None where it has been run."""
+
+    @property
+    def duration(self) -> float:
+        """Seconds of excitation, with the pilot."""
+        return self.plan.duration + (self.pilot.duration if self.pilot else 0.0)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values, as ``--json`` prints them."""
+        kinds = ("mass", "spring", "damper", "coupling")
+        return {
+            "excitation_s": self.duration,
+            "cycle_s": self.plan.cycle_time,
+            "experiments": [
+                {
+                    "name": one.name,
+                    "period_s": one.period,
+                    "periods": one.periods,
+                    "lines_hz": one.frequencies.tolist(),
+                    "detection_hz": (one.detection / one.period).tolist(),
+                }
+                for plan in (self.pilot, self.plan)
+                if plan is not None
+                for one in plan.experiments
+            ],
+            "moves": [vars(one) for one in self.moves],
+            "expected_relative_95": {
+                kind: percent
+                if np.isfinite(percent := 1.96 * self.accuracy.relative(kind))
+                else None
+                for kind in kinds
+            },
+        }
+
+    @property
+    def reached(self) -> float:
+        """Largest expected error over what is wanted."""
+        return self.wanted.reached(self.accuracy)
+
+
+def usual_seconds(model: MachineModel) -> float:
+    """Return the seconds of excitation that a machine gets where nobody asks for another time."""
+    return float(np.clip(SWINGS / mode_band(model)[0], SHORTEST_SECONDS, SECONDS))
+
+
+@dataclass(frozen=True)
+class Timing:
+    """How the time is shared out."""
+
+    pilot_period: float
+    """s."""
+    pilot_experiments: int
+    """M, or 1 where the time is short."""
+    seconds_left: float
+    """For the main experiments."""
+
+
+def timing(setting: Setting, seconds: float) -> Timing:
+    """Share out the time: the pilot has as many experiments as axes where there is time for it.
+
+    Where the time is not even enough for the shortest experiments, that much is taken.
+    """
+    axes, settle = len(setting.loops), settle_time(setting.model)
+    seconds -= 2 * settle  # pilot and main experiments each end with a fade-out
+    least = shortest_period(setting.model)
+    period = (seconds / axes - 2 * settle) / PERIODS / (1 + USUAL)
+    count = axes if period >= least + ROUND else 1
+    whole = np.floor(period / ROUND) if count == axes else np.ceil(least / ROUND)
+    period = ROUND * float(whole)
+    left = float(seconds - count * (settle + PERIODS * period))
+    return Timing(period, count, max(left, axes * (settle + PERIODS * least)))
+
+
+def plan_pilot(
+    setting: Setting,
+    cycle_time: float,
+    times: Timing,
+    seed: int,
+    offsets: Sequence[bool] = (),
+) -> MultisinePlan:
+    """Return weak experiments that move all axes: they find noise, friction and modes.
+
+    They are the first of the two amplitude levels.
+    """
+    plan = experiments_for(
+        setting,
+        cycle_time,
+        times.pilot_period,
+        SHAPES[0],
+        seed,
+        count=times.pilot_experiments,
+        name="pilot",
+        share=PILOT_SHARE,
+        offsets=offsets,
+    )
+    forecast_multisine(plan, setting)
+    return plan
+
+
+def plan_main(
+    setting: Setting,
+    cycle_time: float,
+    noise: Noise,
+    times: Timing,
+    wanted: Wanted,
+    seed: int,
+    offsets: Sequence[bool] = (),
+) -> PlannedFast:
+    """Return the shortest plan that reaches what is wanted, or the best one in the time.
+
+    Parameters
+    ----------
+    setting
+        Model that the plan rests on, loops, limits.
+    cycle_time
+        s.
+    noise
+        Of single samples.
+    times
+        How the time is shared out.
+    wanted
+        Accuracy.
+    seed
+        Of the random phases.
+    offsets
+        Which axes' drives take a torque offset.
+
+    Raises
+    ------
+    PlanRefusedError
+        If the machine can not be excited within its limits.
+    """
+    chosen: tuple[float, float, Shape] | None = None
+    for multiple in MULTIPLES:
+        period = multiple * times.pilot_period
+        needed = len(setting.loops) * (settle_time(setting.model) + PERIODS * period)
+        if chosen is not None and needed > times.seconds_left * (1 + 1e-6):
+            break
+        for shape in SHAPES:
+            error = wanted.reached(
+                _likely(setting, cycle_time, noise, period, shape, seed, offsets)
+            )
+            if chosen is None or error < chosen[0]:
+                chosen = (error, period, shape)
+        if chosen is not None and chosen[0] <= 1.0 and fine_enough(period, setting.model):
+            break
+    if chosen is None:
+        raise PlanRefusedError(
+            f"no period of the fast plan fits into {times.seconds_left:.3g} s: allow more time"
+        )
+    _, period, shape = chosen
+    plan = experiments_for(setting, cycle_time, period, shape, seed, offsets=offsets)
+    return PlannedFast(
+        plan,
+        forecast_multisine(plan, setting),
+        expected_accuracy(setting.model, excitations(plan, setting), noise),
+        wanted,
+    )
+
+
+def freed_of_friction(
+    planned: PlannedFast, setting: Setting, noise: Noise, friction: DryFriction | None
+) -> PlannedFast:
+    """Return the plan with a bias velocity where dry friction was seen and the travel allows one.
+
+    Otherwise the two amplitude levels (the pilot's and this one's) tell friction from elasticity.
+    """
+    seen = () if friction is None else friction.seen(FRICTION_SEEN)
+    if friction is None or not seen:
+        return planned
+    names = ", ".join(friction.axes[k] for k in seen)
+    biased = with_bias(planned.plan, setting, seen)
+    if biased is not None:
+        plan, factor = biased
+        found = replace(
+            planned,
+            plan=plan,
+            moves=forecast_multisine(plan, setting),
+            accuracy=expected_accuracy(setting.model, excitations(plan, setting), noise),
+        )
+        if found.reached <= 1.0:
+            note = (
+                f"{names}: dry friction; a constant velocity is added, so that the axes do not reverse "
+                f"(excitation {100 * factor:.0f} % of what the limits allow)."
+            )
+            return replace(found, plan=replace(plan, notes=(*plan.notes, note)))
+    note = (
+        f"{names}: dry friction, and the travel is too short for a constant velocity that would keep it "
+        "out; it is told from elasticity by two amplitude levels and by the lines between, and what is "
+        "left of it is said."
+    )
+    plan = replace(planned.plan, notes=(*planned.plan.notes, note))
+    return replace(planned, plan=plan)
+
+
+def fine_enough(period: float, model: MachineModel) -> bool:
+    """Return whether odd lines are no farther apart than the narrowest mode is wide."""
+    return 2.0 / period <= narrowest_mode(model)[1]
+
+
+def narrowest_mode(model: MachineModel) -> tuple[float, float]:
+    """Return frequency and half-power width of the narrowest resonance, Hz; inf if there is none."""
+    n = model.mass_matrix.shape[0]
+    mass = np.linalg.inv(model.mass_matrix)
+    system = np.block(
+        [
+            [np.zeros((n, n)), np.eye(n)],
+            [-mass @ model.stiffness_matrix, -mass @ model.damping_matrix],
+        ]
+    )
+    values = np.linalg.eigvals(system)
+    swinging = values[values.imag > 1e-3 * np.abs(values).max()]
+    if swinging.size == 0:
+        return np.inf, np.inf
+    narrow = swinging[np.argmax(swinging.real)]
+    return float(np.abs(narrow) / (2 * np.pi)), float(-2 * narrow.real / (2 * np.pi))
+
+
+def excitations(plan: MultisinePlan, setting: Setting) -> tuple[Excitation, ...]:
+    """Return what the motors will feel in each experiment, by the setting's model."""
+    return tuple(
+        Excitation(
+            2 * np.pi * one.frequencies,
+            predicted_phasors(one, setting)[1],
+            one.periods * one.samples,
+        )
+        for one in plan.experiments
+    )
+
+
+def _likely(
+    setting: Setting,
+    cycle_time: float,
+    noise: Noise,
+    period: float,
+    shape: Shape,
+    seed: int,
+    offsets: Sequence[bool],
+) -> Expected:
+    omega, torques = likely_torques(setting, period, shape, seed, offsets=offsets)
+    samples = PERIODS * round(period / cycle_time)
+    experiments = [Excitation(omega, torque, samples) for torque in torques]
+    return expected_accuracy(setting.model, experiments, noise)

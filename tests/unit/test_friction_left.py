@@ -1,0 +1,92 @@
+"""Dry friction beside a linear model: found with the size it was simulated with, or not at all."""
+
+import numpy as np
+import pytest
+
+from fieldtool.frf.phasors import Phasors
+from fieldtool.identify.friction_left import dry_friction, without_dry_friction
+from fieldtool.records.model import AxisModel, Estimate, MachineModel
+from fieldtool.records.recording import Experiment
+
+STEP, SAMPLES, PERIODS, SETTLE = 1e-3, 1000, 3, 16
+MASS, VISCOUS = 0.5, 0.3
+
+
+def sliding(friction: float, rng: np.random.Generator) -> Experiment:
+    """A rigid mass that is pushed by a multisine: integrated with friction as in a textbook."""
+    lines = np.array([3, 5, 7, 11, 13])
+    phases = rng.uniform(0, 2 * np.pi, lines.size)
+    fine = 10
+    n = SAMPLES * PERIODS
+    t = np.arange((n + SETTLE * SAMPLES) * fine) * STEP / fine
+    push = np.sum(3.0 * np.cos(2 * np.pi * np.outer(t, lines) + phases), axis=1)
+    position, velocity = np.zeros(t.size), 0.0
+    x, h = 0.0, STEP / fine
+    for k in range(t.size):
+        position[k] = x
+        wanted = velocity + h * (push[k] - VISCOUS * velocity) / MASS
+        slip = h * friction / MASS
+        velocity = np.sign(wanted) * max(abs(wanted) - slip, 0.0)
+        x += h * velocity
+    rows = slice(-n * fine, None)
+    return Experiment(
+        "slide", "multisine", ("a",), (), SAMPLES * STEP, np.arange(n) * STEP,
+        position[rows][::fine, None], push[rows][::fine, None] + rng.normal(0, 0.01, (n, 1)),
+    )  # fmt: skip
+
+
+def rigid(viscous: float = VISCOUS) -> MachineModel:
+    axis = AxisModel("a", "rotary", (Estimate(MASS),), (), (), Estimate(viscous))
+    return MachineModel((axis,), ())
+
+
+@pytest.mark.parametrize("friction", [0.2, 1.0])
+def test_friction_is_found(friction: float, fresh_rng: np.random.Generator) -> None:
+    experiment = sliding(friction, fresh_rng)
+    for viscous in (VISCOUS, 0.0):  # what a linear fit would have put down to viscous friction
+        found = dry_friction([experiment], STEP, (3.0, 13.0), rigid(viscous), np.zeros(1))
+        one = found.torque[0]
+        assert one.value == pytest.approx(friction, rel=0.06)
+        assert abs(one.value - friction) < 6 * one.std + 0.02 * friction
+        assert found.seen(5.0) == (0,)
+        assert 0 < found.share[0] < 1
+
+
+def test_no_friction_is_not_found(fresh_rng: np.random.Generator) -> None:
+    experiment = sliding(0.0, fresh_rng)
+    found = dry_friction([experiment], STEP, (3.0, 13.0), rigid(), np.zeros(1))
+    assert abs(found.torque[0].value) < 0.02
+    assert found.seen(8.0) == ()
+
+
+def test_phasors_without_friction_are_those_of_the_linear_machine(
+    fresh_rng: np.random.Generator,
+) -> None:
+    experiment = sliding(0.8, fresh_rng)
+    lines = np.array([3, 5, 7, 11, 13])
+    spectra = [
+        np.fft.rfft(v.reshape(PERIODS, SAMPLES).mean(axis=0))[lines] * 2 / SAMPLES
+        for v in (experiment.position[:, 0], experiment.torque[:, 0])
+    ]
+    phasors = Phasors(
+        "slide", ("a",), ("a",), (), lines / (SAMPLES * STEP), spectra[0][:, None],
+        spectra[1][:, None], np.broadcast_to(np.eye(2) * 1e-8, (5, 2, 2)).astype(complex),
+    )  # fmt: skip
+    (freed,) = without_dry_friction([phasors], [experiment], STEP, [0.8])
+    omega = 2 * np.pi * lines
+    linear = (-MASS * omega**2 + 1j * omega * VISCOUS) * phasors.position[:, 0]
+    before = np.abs(phasors.torque[:, 0] - linear).max()
+    after = np.abs(freed.torque[:, 0] - linear).max()
+    assert after < 0.12 * before
+
+
+def test_a_constant_velocity_keeps_friction_out(fresh_rng: np.random.Generator) -> None:
+    """The sign of a velocity that never reverses has no lines: there is nothing to be found."""
+    experiment = sliding(0.0, fresh_rng)
+    t = experiment.time[:, None]
+    moved = Experiment(
+        "slide", "multisine", ("a",), (), SAMPLES * STEP, experiment.time,
+        experiment.position + 50.0 * t, experiment.torque + 1.0 + VISCOUS * 50.0,
+    )  # fmt: skip
+    found = dry_friction([moved], STEP, (3.0, 13.0), rigid(), np.zeros(1))
+    assert found.torque[0].value == pytest.approx(0.0, abs=1e-6)

@@ -1,0 +1,133 @@
+"""The number of masses of every axis, on evidence; doubts where there are some."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.linalg import eigh
+
+from fieldtool.errors import IdentificationError, NotEnoughDataError
+from fieldtool.identify.mode_search import find_modes
+from fieldtool.identify.order import select_order
+from fieldtool.identify.refine import machine_response
+from fieldtool.identify.response_data import ResponseMatrix
+from fieldtool.records.model import Estimate
+
+
+def frequencies(model):
+    """Undamped, rad/s, rising."""
+    lam = eigh(model.stiffness_matrix, model.mass_matrix, eigvals_only=True)[len(model.axes) :]
+    return np.sqrt(np.abs(lam))
+
+
+def with_noise(names, omega, exact, noise, rng):
+    """Errors e = G dT of a torque that is measured with noise."""
+    axes = len(names)
+    parts = rng.standard_normal((2, *exact.shape))
+    torque = noise * (parts[0] + 1j * parts[1]) / np.sqrt(2.0)
+    outer = noise**2 * exact @ exact.conj().transpose(0, 2, 1)
+    covariance = np.array([np.kron(each, np.eye(axes)) for each in outer])
+    std = np.sqrt(np.einsum("fkk->fk", covariance).real).reshape(exact.shape)
+    return ResponseMatrix(names, omega, exact + exact @ torque, std, covariance)
+
+
+def measured(model, rng, noise=5e-4, lines=100, delays=None):
+    w = frequencies(model)
+    omega = np.linspace(0.3 * w.min(), 1.5 * w.max(), lines)
+    return with_noise(model.names, omega, machine_response(model, omega, delays), noise, rng)
+
+
+@pytest.mark.parametrize("lengths", [(3,), (3, 3, 3), (1, 3, 2), (2, 1, 4), (2, 1, 3, 2)])
+def test_lengths_are_found_without_a_prior(lengths, random_model, fresh_rng):
+    truth = random_model(fresh_rng, lengths, friction=True)
+    found = select_order(measured(truth, fresh_rng), {a.name: a.kind for a in truth.axes})
+    assert tuple(found.masses.values()) == lengths
+    # once in a hundred times noise alone hints at one more mode
+    assert not [doubt for doubt in found.doubts if "hint" not in doubt]
+    assert found.refined.chi2 / found.refined.degrees_of_freedom < 1.3
+    assert [a.kind for a in found.model.axes] == [a.kind for a in truth.axes]
+    for axis, true in zip(found.model.axes, truth.axes, strict=True):
+        for e, t in zip((*axis.masses, *axis.springs), (*true.masses, *true.springs), strict=True):
+            assert e.value == pytest.approx(t.value, rel=0.02)
+    if len(lengths) > 1:
+        assert found.runner_up is not None
+        assert found.runner_up.masses != lengths
+        assert found.runner_up.difference > 30.0
+        assert found.evidence[0].accepted
+
+
+def test_two_axes_alone_can_not_tell_how_their_springs_are_split(random_model, fresh_rng):
+    truth = random_model(fresh_rng, (3, 3))
+    data = measured(truth, fresh_rng)
+    found = select_order(data)
+    assert sum(found.masses.values()) == 6
+    assert any("can hardly tell the masses" in doubt for doubt in found.doubts)
+    known = select_order(data, known={"axis1": 3})
+    assert tuple(known.masses.values()) == (3, 3)
+    assert not any("hardly tell" in doubt for doubt in known.doubts)
+    assert tuple(select_order(data, prior=truth).masses.values()) == (3, 3)
+
+
+def test_delays_are_found(random_model, fresh_rng):
+    truth = random_model(fresh_rng, (2, 3, 2), friction=True)
+    delays = np.array([1e-3, 2e-3, 1.5e-3])
+    found = select_order(measured(truth, fresh_rng, delays=delays))
+    assert tuple(found.masses.values()) == (2, 3, 2)
+    np.testing.assert_allclose([d.value for d in found.refined.delays], delays, rtol=0.05)
+
+
+def test_equal_axes_with_equal_modes(random_model, fresh_rng):
+    one = random_model(fresh_rng, (3,), friction=True)
+    twin = replace(one.axes[0], name="twin")
+    truth = replace(one, axes=(one.axes[0], twin))
+    found = select_order(measured(truth, fresh_rng), known={"axis1": 3})
+    assert tuple(found.masses.values()) == (3, 3)
+
+
+def test_a_mode_near_the_noise_is_named_as_a_doubt(fresh_rng, random_model):
+    truth = random_model(fresh_rng, (3,), friction=True)
+    masses = tuple(Estimate(m) for m in (6.0, 2.0, 0.2))
+    truth = replace(truth, axes=(replace(truth.axes[0], masses=masses),))
+    clear = find_modes(measured(truth, fresh_rng, 1e-4), 4).modal
+    assert clear.omega.size == 2
+    noise = 1e-4 * clear.significance.min() / 9.0
+    doubted = 0
+    for _ in range(20):
+        found = select_order(measured(truth, fresh_rng, noise))
+        doubted += any("Hz" in doubt for doubt in found.doubts)
+        if found.masses["axis1"] == 3 and found.modal.significance.min() < 10.0:
+            assert any("is in doubt" in doubt for doubt in found.doubts)
+    assert doubted >= 3
+
+
+def test_a_machine_that_is_none_is_refused(random_model, fresh_rng):
+    truth = random_model(fresh_rng, (3, 3, 3), friction=True)
+    w = frequencies(truth)
+    omega = np.linspace(0.3 * w.min(), 1.5 * w.max(), 100)
+    mass = truth.mass_matrix
+    mass[1, 7] = mass[7, 1] = 0.3 * np.sqrt(mass[1, 1] * mass[7, 7])
+    s = 1j * omega[:, None, None]
+    whole = np.linalg.inv(s**2 * mass + s * truth.damping_matrix + truth.stiffness_matrix)
+    motors = truth.first_masses
+    data = with_noise(truth.names, omega, whole[:, motors][:, :, motors], 5e-4, fresh_rng)
+    with pytest.raises(IdentificationError, match="closest are the masses") as refused:
+        select_order(data)
+    assert "Hz" in str(refused.value)
+
+
+def test_known_lengths_that_do_not_fit_are_refused(random_model, fresh_rng):
+    data = measured(random_model(fresh_rng, (3, 2, 2), friction=True), fresh_rng)
+    with pytest.raises(IdentificationError, match="hold 4 modes"):
+        select_order(data, known={"axis1": 2, "axis2": 2, "axis3": 2})
+    with pytest.raises(ValueError, match="no axis z"):
+        select_order(data, known={"z": 2})
+    with pytest.raises(ValueError, match="at least one mass"):
+        select_order(data, known={"axis1": 0})
+
+
+def test_every_pair_must_be_measured(random_model, fresh_rng):
+    data = measured(random_model(fresh_rng, (2, 2)), fresh_rng)
+    response, std = data.response.copy(), data.std.copy()
+    response[:, 0, 1] = response[:, 1, 0] = np.nan
+    with pytest.raises(NotEnoughDataError, match="axis1 and axis2"):
+        select_order(ResponseMatrix(data.names, data.omega, response, std))
