@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 from bench_demo import run
 from numpy.typing import NDArray
-from tests.conftest import _random_model
 
 from drives.profile import load_machine
 from fieldtool.frf.joint import joint_response
@@ -22,6 +21,7 @@ from fieldtool.records.model import MachineModel
 from fieldtool.records.recording import Recording, load
 from fieldtool.workflow import Options
 from fieldtool.workflow.models import truth_model
+from tests.conftest import _random_model
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]

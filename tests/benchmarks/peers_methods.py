@@ -6,8 +6,8 @@ are told the number of modes.  None of them uses the measured noise.
 
 import contextlib
 import io
+import pkgutil
 import warnings
-from collections.abc import Callable
 from functools import wraps
 
 import numpy as np
@@ -85,8 +85,12 @@ def vector_fitting(more: int = 0, real: int = 0) -> Method:
     return method
 
 
-def aaa(more: int = 0) -> Method:
-    """Scipy's AAA on the sum of the drive points at both signs of frequency; residues by LS."""
+def aaa(more: int = 1) -> Method:
+    """Scipy's AAA on the sum of the drive points at both signs of frequency.
+
+    `more` pairs of poles than there are modes, then those that rise highest; residue matrices by
+    plain linear least squares.
+    """
 
     @quiet
     def method(case: Case) -> Found:
@@ -104,16 +108,8 @@ def aaa(more: int = 0) -> Method:
         modes = visible(least_squares_residues(case, poles), case.modes)
         modes = least_squares_residues(case, modes.poles)
         found = with_machine(case, modes)
-        zeros = rational.roots()
-        zeros = zeros[(zeros.imag > s[0].imag) & (zeros.imag < s[-1].imag)]
-        nearest = zeros[np.argmin(np.abs(zeros.real))] if zeros.size else np.nan
-        one = len(case.masses) == 1
-        return Found(
-            found.poles,
-            found.model,
-            found.why,
-            float(np.abs(nearest) / (2 * np.pi)) if one else np.nan,
-        )
+        dip = first_antiresonance(rational, case)
+        return Found(found.poles, found.model, found.why, dip)
 
     return method
 
@@ -127,9 +123,11 @@ def _vibrations(poles: ComplexArray, case: Case) -> ComplexArray:
 
 
 def ema(method_name: str, order: int, near: float = 0.01, alike: float = 0.1) -> Method:
-    """sdypy-EMA: LSCF on all lines of the base grid (those not excited by cubic splines), or RFP
-    on the lines themselves; the stable poles nearest to the true ones, as by a perfect operator's
-    clicks; LSFD for the residues, with the rigid body as its lower residual.
+    """sdypy-EMA: LSCF or RFP, then LSFD with the rigid body as its lower residual.
+
+    LSCF works on all lines of the base grid, those not excited by cubic splines; RFP on the lines
+    themselves.  Poles that repeat at the next order (to the shares `near` and `alike` of frequency
+    and damping) are stable; those nearest to the true ones are taken, as by an operator's clicks.
     """
 
     @quiet
@@ -247,12 +245,11 @@ def _half_power(omega: FloatArray, size: FloatArray, k: int) -> complex | None:
 
 
 def missing(package: str) -> bool:
-    """Whether a package is not installed."""
+    """Whether a package, or a name in it, is not there."""
     try:
-        __import__(package)
-    except ImportError:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            pkgutil.resolve_name(package)
+    except (ImportError, AttributeError):
         return True
     return False
-
-
-Factory = Callable[..., Method]

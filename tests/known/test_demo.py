@@ -36,14 +36,16 @@ def drawn_anew(seed: int) -> MachineProfile:
     return machine.model_copy(update={"simulation": simulation, "bus": bus})
 
 
-@pytest.fixture(scope="module")
-def result(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SessionResult]:
+@pytest.fixture(scope="module", params=["classic", "fast"])
+def result(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[SessionResult]:
     seed = int(np.random.SeedSequence().generate_state(1)[0])
     print("seed", seed)
     machine = drawn_anew(seed)
     register(CHANNEL, simulated_machine(machine))
     try:
-        options = Options(write=True)
+        options = Options(plan=request.param, write=True)
         folder = tmp_path_factory.mktemp("session")
         yield workflow.run(machine, folder / "one", options, confirm=lambda _: True)
     finally:

@@ -208,11 +208,11 @@ class Bench:
         assert "defect of fieldtool" not in outcome.err, outcome.err
         return outcome
 
-    def measure(self) -> Outcome:
-        return self.command("measure", self.profile, "--out", self.out)
+    def measure(self, *options: str, plan: str = "classic") -> Outcome:
+        return self.command("measure", self.profile, "--plan", plan, "--out", self.out, *options)
 
-    def run(self, *options: str) -> Outcome:
-        return self.command("run", self.profile, "--out", self.out, *options)
+    def run(self, *options: str, plan: str = "classic") -> Outcome:
+        return self.command("run", self.profile, "--plan", plan, "--out", self.out, *options)
 
     def connected(self, stop: Callable[[], bool] = lambda: False) -> Any:
         return connect(load_machine(self.profile), stop_requested=stop)

@@ -14,7 +14,7 @@ def turntable():
     return yaml.safe_load(text)
 
 
-@pytest.mark.parametrize("f", [0.0,0.1, 0.3, 1.0, 2.0, 3.0])
+@pytest.mark.parametrize("f", [0.0, 0.1, 0.3, 1.0, 2.0, 3.0])
 def test_explore_friction(make_bench, turntable, f):
     if f:
         for axis in turntable["simulation"]["axes"][:1]:

@@ -157,7 +157,7 @@ def test_a_byte_order_mark_does_no_harm(bench):
 
 @pytest.mark.parametrize("name", ["nothing", "no/such.yaml", "x" * 5000, "."])
 def test_a_profile_that_is_not_there_is_refused(bench, name):
-    outcome = bench.command("measure", name, "--out", bench.out)
+    outcome = bench.command("measure", name, "--plan", "classic", "--out", bench.out)
     assert outcome.code == 2
     assert "profile" in outcome.err or "name of a file" in outcome.err
 
@@ -487,7 +487,7 @@ def test_a_session_folder_that_is_a_file_is_refused(bench):
 
 def test_a_session_folder_below_a_file_is_refused(bench):
     bench.out.write_text("a file")
-    outcome = bench.command("run", bench.profile, "--out", bench.out / "below")
+    outcome = bench.command("run", bench.profile, "--plan", "classic", "--out", bench.out / "below")
     assert outcome.code == 3
     assert "results can not be written here" in outcome.err
     nothing_was_done(bench)

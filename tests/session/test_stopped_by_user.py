@@ -17,7 +17,9 @@ from drives.errors import UserStopError
 from drives.sim.faults import Fault
 from fieldtool import workflow
 from fieldtool.records.recording import load
+from fieldtool.workflow import Options
 
+CLASSIC = Options(plan="classic")
 TABLE, ARM = 11, 12
 CHECKING = 3000
 """A SYNC in the middle of the direction checks."""
@@ -138,7 +140,7 @@ def test_between_measuring_and_writing(small_bench, monkeypatch, module, name, c
 def test_a_script_that_asks_for_a_stop_gets_one(bench):
     """The same from Python, without the command line's handler."""
     with pytest.raises(UserStopError):
-        workflow.run(bench.profile, bench.out, stop_requested=lambda: bench.sweeps)
+        workflow.run(bench.profile, bench.out, CLASSIC, stop_requested=lambda: bench.sweeps)
     is_safe(bench)
     assert not bench.recording().experiments[-1].complete
 
@@ -147,7 +149,7 @@ def test_a_script_without_a_stop_function_is_safe_too(bench):
     """Python's own KeyboardInterrupt in the middle of a cycle: axes off, data kept."""
     bench.in_sweep.append((Pressed(TABLE), 0))
     with pytest.raises(UserStopError) as stop:
-        workflow.run(bench.profile, bench.out)
+        workflow.run(bench.profile, bench.out, CLASSIC)
     assert isinstance(stop.value.__cause__, KeyboardInterrupt)
     is_safe(bench)
     assert not bench.recording().experiments[-1].complete
@@ -160,7 +162,18 @@ def test_fieldtool_run_in_a_process_of_its_own(tmp_path, profile_of_two):
     out, log = tmp_path / "out", tmp_path / "log.txt"
     with log.open("w") as output:
         process = subprocess.Popen(
-            [sys.executable, "-u", "-m", "fieldtool", "run", str(profile), "--out", str(out)],
+            [
+                sys.executable,
+                "-u",
+                "-m",
+                "fieldtool",
+                "run",
+                str(profile),
+                "--plan",
+                "classic",
+                "--out",
+                str(out),
+            ],
             stdout=output,
             stderr=subprocess.STDOUT,
             env={**os.environ, "COLUMNS": "200"},

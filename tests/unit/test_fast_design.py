@@ -60,7 +60,9 @@ def simulated(one: MultisineExperiment, where: Setting) -> tuple[np.ndarray, np.
 
 def test_every_axis_comes_near_to_a_limit_and_none_passes_it() -> None:
     where = setting()
-    plan = experiments_for(where, CYCLE, 1.6, SHAPES[0], seed=int(np.random.default_rng().integers(99)))
+    plan = experiments_for(
+        where, CYCLE, 1.6, SHAPES[0], seed=int(np.random.default_rng().integers(99))
+    )
     largest = np.zeros(2)
     for one in plan.experiments:
         position, torque = simulated(one, where)
@@ -178,12 +180,16 @@ def test_short_travel_leaves_no_bias() -> None:
     assert with_bias(plan, where, (0,)) is None
 
 
-@pytest.mark.parametrize(("travel", "word"), [(40.0, "do not reverse"), (0.6, "two amplitude levels")])
+@pytest.mark.parametrize(
+    ("travel", "word"), [(40.0, "do not reverse"), (0.6, "two amplitude levels")]
+)
 def test_what_is_done_about_friction_is_said(travel: float, word: str) -> None:
     where = setting(travel=travel)
     noise = Noise(np.full(2, 0.004), np.full(2, 2e-6))
     main = plan_main(where, CYCLE, noise, timing(where, 12.0), Wanted(), 2)
-    friction = DryFriction(("a", "b"), (Estimate(0.5, 0.01), Estimate(0.0, 0.1)), np.array([0.1, 0]))
+    friction = DryFriction(
+        ("a", "b"), (Estimate(0.5, 0.01), Estimate(0.0, 0.1)), np.array([0.1, 0])
+    )
     freed = freed_of_friction(main, where, noise, friction)
     assert any(word in note for note in freed.plan.notes)
     assert bool(np.any(freed.plan.experiments[0].bias)) == (travel > 1)

@@ -116,9 +116,7 @@ def test_the_fit_reaches_the_accuracy_that_was_expected(
     plan = [Excitation(omega, torque, SAMPLES) for torque in torques]
     noise = Noise(np.full(2, TORQUE), np.full(2, POSITION))
     expected = expected_accuracy(model, plan, noise)
-    by_name = dict(
-        zip((p.name for p in expected.parameters), expected.std.tolist(), strict=True)
-    )
+    by_name = dict(zip((p.name for p in expected.parameters), expected.std.tolist(), strict=True))
     reported = dict(zip(found.names, np.sqrt(np.diag(found.covariance)).tolist(), strict=True))
     assert set(by_name) == set(reported)
     for name, std in by_name.items():  # excess of chi2 widens the reported ones a little
@@ -159,7 +157,9 @@ def test_what_is_not_excited_is_not_expected(
         expected_accuracy(model, [], noise)
 
 
-def test_no_experiment_is_refused(random_model: RandomModel, fresh_rng: np.random.Generator) -> None:
+def test_no_experiment_is_refused(
+    random_model: RandomModel, fresh_rng: np.random.Generator
+) -> None:
     model = random_model(fresh_rng, (2,))
     with pytest.raises(NotEnoughDataError, match="no experiment"):
         joint_spectra([], machine_response(model, np.array([1.0])))
