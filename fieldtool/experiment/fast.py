@@ -27,7 +27,7 @@ from fieldtool.experiment.multisine_forecast import (
     scaled_to_limits,
 )
 from fieldtool.experiment.phases import orthogonal_phases
-from fieldtool.records.closed_loop import ComplexArray
+from fieldtool.records.closed_loop import AxisLoop, ComplexArray
 from fieldtool.records.model import FloatArray, MachineModel
 
 IntArray = NDArray[np.int_]
@@ -62,6 +62,10 @@ BIAS_MARGIN = 1.2
 """Bias velocity over the excitation's largest velocity."""
 LEAST_FACTOR = 0.1
 """Below it the excitation would be too weak beside what a bias velocity gains."""
+BEYOND, SMOOTH = 8.0, 0.05
+"""A drive takes torque offsets once a cycle.  Their steps must not reach the torque, which is sampled
+at the same rate: at so many times the highest line, below the rate of the cycles, the drive's filters
+may pass so much."""
 LEVELLINGS = 3
 """Of simulating the plan and scaling each axis' input."""
 ROUNDS = 8
@@ -284,6 +288,11 @@ def likely_torques(
     return inputs.omega, torques
 
 
+def smooth(loop: AxisLoop, omega: float) -> bool:
+    """Return whether a drive's filters leave nothing of steps that come at this rate, rad/s."""
+    return abs(loop.torque_shape(1j * omega)) < SMOOTH
+
+
 def _inputs(
     setting: Setting, lines: NDArray[np.int64], period: float, offsets: Sequence[bool]
 ) -> "_Inputs":
@@ -297,7 +306,7 @@ def _inputs(
     by_torque = np.zeros((omega.size, axes), dtype=np.bool_)
     for k in range(axes):
         position[:, :, k], torque[:, :, k] = loop.response(omega, k)
-        if offsets[k]:
+        if offsets[k] and smooth(setting.loops[k], BEYOND * omega[-1]):
             passed = np.abs([setting.loops[k].gain_of_reference(1j * w) for w in omega])
             by_torque[:, k] = passed < WEAK * passed.max()
             unit = np.zeros((omega.size, axes), dtype=np.complex128)

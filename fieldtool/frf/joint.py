@@ -73,7 +73,7 @@ def joint_response(
         Those to use; None: all complete ones of kind ``multisine`` that drive an axis.
     offset_sampled, offset_rows
         When torques are sampled after a held torque offset took effect, s, and in which row it
-        shows; only for recordings with ``AXIS.torque_offset``
+        shows; only for recordings with ``AXIS.torque_offset`` that no low-pass follows
         (see :func:`~fieldtool.frf.held_targets.held_offset`).
 
     Raises

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fieldtool.frf.held_targets import folded_phasors, held_offset, lags
+from fieldtool.frf.held_targets import folded_phasors, held_offset
 from fieldtool.frf.joint_input import TORQUE_OFFSET, JointInput
 from fieldtool.frf.phasors import ComplexArray, FloatArray, Phasors
 from fieldtool.frf.transient import SteadySpectra, noise_covariance, steady_spectra
@@ -76,8 +76,8 @@ def line_phasors(
         The experiments, with excited lines.
     offset_sampled, offset_rows
         When torques are sampled after a held torque offset took effect, s, and in which row it
-        shows (see :func:`~fieldtool.frf.held_targets.held_offset`); None: at the SYNC, behind the
-        drive's lag where that is known.
+        shows (see :func:`~fieldtool.frf.held_targets.held_offset`); None: no correction, because a
+        filter behind the offset leaves nothing of its steps, as where the fast plan uses one.
     """
     levels = _levels(inputs)
     groups: dict[tuple[int, int], list[int]] = {}
@@ -170,13 +170,10 @@ def _correction(
     T = recording.sample_period
     for axis, name in enumerate(recording.names):
         values = one.experiment.extra.get(f"{name}.{TORQUE_OFFSET}")
-        if values is None:
+        if values is None or sampled is None:
             continue
-        lag = lags(recording).get(name, 0.0)
-        after = sampled if sampled is not None else (T - lag if 0 < lag < T else 0.0)
         offset = _line_spectrum(values[one.rows], one.periods, L)[:, None]
-        extra_rows = rows + (1 if sampled is None and 0 < lag < T else 0)
-        correction[:, axis] += held_offset(frequencies, offset, T, after, extra_rows)[:, 0]
+        correction[:, axis] += held_offset(frequencies, offset, T, sampled, rows)[:, 0]
     return correction
 
 

@@ -6,6 +6,7 @@ from drives.canopen_drive import CanopenGroup
 from drives.parameters import read_parameters
 from drives.profile import MachineProfile
 from fieldtool.experiment.axes import Axes
+from fieldtool.experiment.fast import smooth
 from fieldtool.experiment.forecast import Setting
 from fieldtool.frf.held_targets import LINEAR_TARGETS
 from fieldtool.records.closed_loop import loop_from_parameters
@@ -57,6 +58,7 @@ def recording_header(
         f"{d.axis}={d.profile.torque_lag!r}"
         for d in group.drives
         if d.profile.interpolation == "linear"
+        and not smooth(loop_from_parameters(read_parameters(d)), 2 * np.pi / cycle_time)
     ]
     if linear:
         source[LINEAR_TARGETS] = " ".join(linear)
