@@ -47,7 +47,7 @@ SETTLE_AT_LEAST = 0.6
 """And at least so many seconds."""
 PERIODS = 2
 """Whole periods of each experiment: the least that tell noise from signal."""
-SHARE_OF_LIMITS = 0.55
+SHARE_OF_LIMITS = 0.65
 """Of every limit that the plan may use by the model that it rests on."""
 PILOT_SHARE = 0.2
 """The same for the pilot, which rests on the machine as last accepted."""
@@ -86,7 +86,7 @@ class Shape:
         return relative
 
 
-SHAPES = (Shape(0.0), Shape(0.5), Shape(-0.5))
+SHAPES = (Shape(-0.75), Shape(-0.5), Shape(0.0))
 """To choose from, by the accuracy to expect."""
 
 

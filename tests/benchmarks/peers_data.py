@@ -95,8 +95,7 @@ def exact_response(model: MachineModel, omega: FloatArray) -> ComplexArray:
     inputs = np.vstack([np.zeros((n, len(model.axes))), np.linalg.inv(model.mass_matrix)[:, first]])
     resolvents = 1j * omega[:, None, None] * np.eye(2 * n) - _state_matrix(model)
     states = np.linalg.solve(resolvents, np.broadcast_to(inputs, (omega.size, *inputs.shape)))
-    response: ComplexArray = states[:, first, :]
-    return response
+    return np.asarray(states[:, first, :], dtype=np.complex128)
 
 
 def random_cases(

@@ -119,7 +119,7 @@ def modes_accelerance(modes: Modes) -> Callable[[ComplexArray], ComplexArray]:
     """Accelerance of the first axis as a function of s."""
 
     def value(s: ComplexArray) -> ComplexArray:
-        total = modes.rigid[0, 0] + np.zeros_like(s)
+        total: ComplexArray = modes.rigid[0, 0] + np.zeros_like(s)
         for pole, residue in zip(modes.poles, modes.residues[:, 0, 0], strict=True):
             total = total + s**2 * (residue / (s - pole) + residue.conj() / (s - pole.conj()))
         return total

@@ -73,7 +73,7 @@ def vector_fitting(more: int = 0, real: int = 0) -> Method:
         found = with_machine(case, modes)
 
         def accelerance(s: ComplexArray) -> ComplexArray:
-            total = constant[0, 0] + np.zeros_like(s)
+            total: ComplexArray = constant[0, 0] + np.zeros_like(s)
             for pole, residue in zip(poles, residues[:, 0, 0], strict=True):
                 total = total + residue / (s - pole)
                 if pole.imag > 0.0:
@@ -198,7 +198,8 @@ def operator_poles(case: Case) -> ComplexArray:
 @quiet
 def peak_picking(case: Case) -> Found:
     """Peaks of the largest singular value of the accelerance and their half-power widths."""
-    size = np.linalg.svd(case.balanced, compute_uv=False)[:, 0]
+    values = np.linalg.svd(case.balanced, compute_uv=False)
+    size = np.asarray(values[:, 0], dtype=np.float64)
     peaks, _ = find_peaks(size)
     poles = [p for k in peaks if (p := _half_power(case.data.omega, size, int(k))) is not None]
     heights = np.array([np.interp(abs(p), case.data.omega, size) for p in poles])

@@ -194,8 +194,9 @@ def _moved(
 
 def _weights(case: Case, weighting: str) -> FloatArray:
     data = case.data
+    weights: FloatArray = np.sqrt(2.0) / data.std
     if weighting == "diagonal":
-        return np.sqrt(2.0) / data.std
+        return weights
     weights = np.ones(data.std.shape)
     if weighting == "acceleration":
         weights = weights * data.omega[:, None, None] ** 2
