@@ -47,6 +47,8 @@ SETTLE_AT_LEAST = 0.6
 """And at least so many seconds."""
 PERIODS = 2
 """Whole periods of each experiment: the least that tell noise from signal."""
+MORE_PERIODS = 3
+"""Where there is time: what decays is told from what repeats better than by two."""
 SHARE_OF_LIMITS = 0.65
 """Of every limit that the plan may use by the model that it rests on."""
 PILOT_SHARE = 0.2
@@ -154,6 +156,7 @@ def experiments_for(
     name: str = "fast",
     share: float = SHARE_OF_LIMITS,
     offsets: Sequence[bool] = (),
+    periods: int = PERIODS,
 ) -> MultisinePlan:
     """Return orthogonal experiments that use this share of the limits.
 
@@ -175,6 +178,8 @@ def experiments_for(
         Of every limit.
     offsets
         Which axes' drives take a torque offset; none without.
+    periods
+        Whole periods of each experiment.
 
     Raises
     ------
@@ -192,7 +197,7 @@ def experiments_for(
         torque=np.where(inputs.by_torque, size, 0.0).astype(np.complex128),
         cycle_time=cycle_time,
         samples=samples,
-        periods=PERIODS,
+        periods=periods,
         settle=round(settle_time(setting.model) / cycle_time),
         seed=seed,
         name=name,

@@ -316,7 +316,7 @@ def _open_directions(
     solution: Fit, parameters: list[Parameter], logarithmic: NDArray[np.bool_]
 ) -> list[Unknown]:
     """Combinations that can change by half or more together without a visible misfit."""
-    _, singular, rows = np.linalg.svd(solution.jacobian, full_matrices=False)
+    _, singular, rows = np.linalg.svd(solution.triangle, full_matrices=False)
     found = []
     for s, row in zip(singular, rows, strict=True):
         relative = np.sqrt(solution.excess) / s if s > 0.0 else inf

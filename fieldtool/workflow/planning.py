@@ -8,6 +8,7 @@ import numpy as np
 
 from fieldtool.errors import PlanRefusedError
 from fieldtool.experiment.fast import (
+    MORE_PERIODS,
     PERIODS,
     PILOT_SHARE,
     SHAPES,
@@ -117,6 +118,8 @@ class Timing:
     """s."""
     pilot_experiments: int
     """M, or 1 where the time is short."""
+    periods: int
+    """Of each main experiment."""
     seconds_left: float
     """For the main experiments."""
 
@@ -129,12 +132,15 @@ def timing(setting: Setting, seconds: float) -> Timing:
     axes, settle = len(setting.loops), settle_time(setting.model)
     seconds -= 2 * settle  # pilot and main experiments each end with a fade-out
     least = shortest_period(setting.model)
-    period = (seconds / axes - 2 * settle) / PERIODS / (1 + USUAL)
-    count = axes if period >= least + ROUND else 1
-    whole = np.floor(period / ROUND) if count == axes else np.ceil(least / ROUND)
-    period = ROUND * float(whole)
+    for periods in (MORE_PERIODS, PERIODS):
+        longest = (seconds / axes - 2 * settle) / (PERIODS + USUAL * periods)
+        if longest >= least + ROUND:
+            period, count = ROUND * float(np.floor(longest / ROUND)), axes
+            break
+    else:
+        period, count, periods = ROUND * float(np.ceil(least / ROUND)), 1, PERIODS
     left = float(seconds - count * (settle + PERIODS * period))
-    return Timing(period, count, max(left, axes * (settle + PERIODS * least)))
+    return Timing(period, count, periods, max(left, axes * (settle + PERIODS * least)))
 
 
 def plan_pilot(
@@ -199,12 +205,12 @@ def plan_main(
     chosen: tuple[float, float, Shape] | None = None
     for multiple in MULTIPLES:
         period = multiple * times.pilot_period
-        needed = len(setting.loops) * (settle_time(setting.model) + PERIODS * period)
+        needed = len(setting.loops) * (settle_time(setting.model) + times.periods * period)
         if chosen is not None and needed > times.seconds_left * (1 + 1e-6):
             break
         for shape in SHAPES:
             error = wanted.reached(
-                _likely(setting, cycle_time, noise, period, shape, seed, offsets)
+                _likely(setting, cycle_time, noise, (period, times.periods), shape, seed, offsets)
             )
             if chosen is None or error < chosen[0]:
                 chosen = (error, period, shape)
@@ -215,7 +221,9 @@ def plan_main(
             f"no period of the fast plan fits into {times.seconds_left:.3g} s: allow more time"
         )
     _, period, shape = chosen
-    plan = experiments_for(setting, cycle_time, period, shape, seed, offsets=offsets)
+    plan = experiments_for(
+        setting, cycle_time, period, shape, seed, offsets=offsets, periods=times.periods
+    )
     return PlannedFast(
         plan,
         forecast_multisine(plan, setting),
@@ -298,12 +306,13 @@ def _likely(
     setting: Setting,
     cycle_time: float,
     noise: Noise,
-    period: float,
+    timed: tuple[float, int],
     shape: Shape,
     seed: int,
     offsets: Sequence[bool],
 ) -> Expected:
+    period, periods = timed
     omega, torques = likely_torques(setting, period, shape, seed, offsets=offsets)
-    samples = PERIODS * round(period / cycle_time)
+    samples = periods * round(period / cycle_time)
     experiments = [Excitation(omega, torque, samples) for torque in torques]
     return expected_accuracy(setting.model, experiments, noise)
