@@ -6,7 +6,7 @@ statusword, actual position, actual torque.
 
 import struct
 from dataclasses import dataclass, field
-from math import ceil, floor
+from math import ceil, floor, sqrt
 
 import can
 
@@ -29,6 +29,9 @@ STUCK_SHARE, STUCK_UNITS, STUCK_TIME = 8, 20, 0.02
 """A target that moves by a part of the following error window, and by so many units at least,
 while the position does not change at all for so many seconds: the encoder is stuck, or the axis is
 blocked."""
+STUCK_SLOWEST = 10.0
+"""Natural frequency of the slowest position loop, rad/s: it is given the time to drive an axis that
+reverses on across one unit of its encoder."""
 _MOST_UNITS = 2**33
 """More position units than any change or error of a 32-bit position can have."""
 
@@ -225,6 +228,7 @@ def channel_of(
     scale, limits = drive.scaling, drive.limits
     units = min(limits.velocity * cycle_time / scale.velocity, _MOST_UNITS)
     span = ceil(SPAN_UNITS / units)
+    window = floor(min(limits.following_error / scale.position * (1 + 1e-12), _MOST_UNITS))
     return Channel(
         drive,
         free,
@@ -236,6 +240,16 @@ def channel_of(
         span_units=1 + floor(units * span),
         torque=floor(min(limits.torque / scale.torque * (1 + 1e-12), _MOST_UNITS)),
         takes_offset=takes_offset,
-        still_allowed=max(3, round(STUCK_TIME / cycle_time)),
-        window=floor(min(limits.following_error / scale.position * (1 + 1e-12), _MOST_UNITS)),
+        still_allowed=max(3, round(_stuck_time(window) / cycle_time)),
+        window=window,
     )
+
+
+def _stuck_time(window: int) -> float:
+    """Return how long a position may stand while its target moves away, s.
+
+    A loop of natural frequency w accelerates the axis by w^2 times the target's mean distance, half
+    of what is asked for in ``is_stuck``; from rest one unit then takes sqrt(2 units / acceleration).
+    """
+    distance = max(window // STUCK_SHARE, STUCK_UNITS) / 2
+    return STUCK_TIME + sqrt(2 / distance) / STUCK_SLOWEST

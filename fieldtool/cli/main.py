@@ -98,7 +98,9 @@ Plan = Annotated[
 ]
 Seconds = Annotated[
     float | None,
-    typer.Option("--time", help="Seconds of excitation that the fast plan may take.", min=1.0),
+    typer.Option(
+        "--time", help="Seconds of excitation that the fast plan may take.", min=1.0, max=1800.0
+    ),
 ]
 PlanOnly = Annotated[
     bool, typer.Option("--plan-only", help="Show what would be measured, and end there.")
@@ -493,6 +495,8 @@ def _lengths(masses: Sequence[str]) -> dict[str, int]:
         name, equals, count = text.partition("=")
         if not equals or not count.isdigit() or not 1 <= int(count) <= 16:
             raise typer.BadParameter(f"--masses takes AXIS=N with N from 1 to 16, got {text!r}")
+        if name in lengths:
+            raise typer.BadParameter(f"--masses names {name} twice")
         lengths[name] = int(count)
     return lengths
 

@@ -1,6 +1,7 @@
 """What a session looks like on a terminal: where it is, how long it will take, what it found."""
 
 from collections.abc import Callable, Mapping, Sequence
+from itertools import zip_longest
 from time import perf_counter
 from types import TracebackType
 from typing import Any
@@ -130,11 +131,10 @@ class TerminalScreen:
                 )
         self.console.print(table)
         self._show_moves(planned.moves)
-        rests_on = "machine as last accepted" if planned.pilot else "pilot's model"
         self.console.print(
-            f"  Simulated with the {rests_on}: every limit is kept. {_clock(planned.duration)} of "
-            f"excitation, a cycle of {planned.plan.cycle_time * 1000:g} ms; all axes stay under "
-            "position control."
+            f"  Simulated with the {planned.rests_on}: every limit is kept. "
+            f"{_clock(planned.duration)} of excitation, a cycle of "
+            f"{planned.plan.cycle_time * 1000:g} ms; all axes stay under position control."
         )
         self.console.print(Text("  " + expected_text(planned.accuracy)))
 
@@ -290,7 +290,7 @@ def model_table(
             known: Sequence[Estimate | None] = (
                 getattr(true_axis, plural) if true_axis else [None] * len(values)
             )
-            for j, (value, true) in enumerate(zip(values, known, strict=False)):
+            for j, (value, true) in enumerate(zip_longest(values, known[: len(values)])):
                 _row(table, axis.name, f"{what} {j + 1}", value, units[k][what], true, truth)
         for what, friction in (
             ("viscous friction, motor", axis.viscous_friction),

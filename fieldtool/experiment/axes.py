@@ -39,6 +39,13 @@ class Axes:
     centre: FloatArray
     units: tuple[str, ...] = ()
     """Of positions, for messages."""
+    resolution: FloatArray | None = None
+    """One count of each axis' encoder, shape (M,), rad or m; None where it is fine enough."""
+
+    @property
+    def counts(self) -> FloatArray:
+        """One count of each encoder, shape (M,), rad or m; 0 where it was not given."""
+        return np.zeros(len(self.names)) if self.resolution is None else self.resolution
 
     def unit(self, k: int) -> str:
         """Return the unit of an axis' positions, for messages; empty where it was not given."""

@@ -26,6 +26,10 @@ CHECK_MOVE = 0.02
 """Share of the travel by which each axis moves when its direction is checked."""
 CHECK_NUDGE = 0.1
 """Share of that move by which each axis is nudged first."""
+CHECK_NUDGE_COUNTS, CHECK_NUDGE_MOST = 20, 0.5
+"""A nudge is so many counts of the encoder at least, but never more than this share of the move."""
+CHECK_COUNTS = 3
+"""Counts of the encoder that are added to whatever an axis may go astray."""
 CHECK_SLICE = 2
 """Cycles after which the check looks at what the axes did."""
 CHECK_ASTRAY, CHECK_PUSHED = 1e-3, 10.0
@@ -36,7 +40,8 @@ CHECK_ASTRAY_ERROR = 0.004
 CHECK_TIME = 1.0
 """Seconds that each of these moves takes at least, so that slow loops follow it."""
 CHECK_QUIET = 0.5
-"""Share of what it may drift within which an axis counts as standing, before the check begins."""
+"""Share of what it may drift within which an axis counts as standing, before the check begins;
+where it stands does not matter: friction may hold it beside its target."""
 CHECK_STARTED = 0.02
 """Share of the check's move that an axis must have done when half of it was commanded."""
 LONGEST_MOVE = 600.0
@@ -50,7 +55,10 @@ def check_directions(group: Mover, axes: Axes, cycle_time: float, keep: Keep) ->
 
     Each axis moves towards its centre, at first by a nudge only.  It is judged every few cycles, long
     before its following error leaves the limit: a loop of the wrong sign runs away from the smallest
-    push, its own or another axis', and the nudges find that while it is slow.
+    push, its own or another axis', and the nudges find that while it is slow.  Each move is judged
+    from where the axes stand when it begins: friction may have held one beside its target, but not
+    farther from its very first start than its own nudge (in the moves after the nudges: than it may
+    be pushed).
 
     Raises
     ------
@@ -66,11 +74,12 @@ def check_directions(group: Mover, axes: Axes, cycle_time: float, keep: Keep) ->
         with group.motion(cycle_time) as motion:
             start = motion.position
             for k in range(len(axes.names)):
-                nudge = _DirectionCheck(axes, k, start, cycle_time, nudge=True)
+                stands = motion.position
+                nudge = _DirectionCheck(axes, k, start, stands, cycle_time, nudge=True)
                 _stream_check(motion, nudge, axes.names[k], experiments.append)
             experiments.clear()  # of the nudges only one that was cut short is worth keeping
             for k in range(len(axes.names)):
-                check = _DirectionCheck(axes, k, start, cycle_time)
+                check = _DirectionCheck(axes, k, start, motion.position, cycle_time)
                 capture = _stream_check(motion, check, axes.names[k], experiments.append)
                 check.judge(capture)
     except BaseException as error:
@@ -105,12 +114,27 @@ class _DirectionCheck:
     """
 
     def __init__(
-        self, axes: Axes, k: int, start: FloatArray, cycle_time: float, nudge: bool = False
+        self,
+        axes: Axes,
+        k: int,
+        start: FloatArray,
+        stands: FloatArray,
+        cycle_time: float,
+        nudge: bool = False,
     ) -> None:
         self._axes, self._k, self._start, self._nudge = axes, k, start, nudge
         limits = axes.limits[k]
-        size = CHECK_MOVE * (limits.travel[1] - limits.travel[0])
-        self._wanted = float(np.copysign(size, axes.centre[k] - start[k]))
+        travel = np.array([one.travel[1] - one.travel[0] for one in axes.limits])
+        errors = np.array([one.following_error for one in axes.limits])
+        self._slack = CHECK_COUNTS * axes.counts
+        astray = np.maximum(CHECK_ASTRAY * travel, CHECK_ASTRAY_ERROR * errors)
+        self._allowed = astray + self._slack
+        sizes = CHECK_MOVE * travel
+        most = np.minimum(CHECK_NUDGE_COUNTS * axes.counts, CHECK_NUDGE_MOST * sizes)
+        nudges = np.maximum(CHECK_NUDGE * sizes, most)
+        self._reach = nudges if nudge else np.maximum(nudges, CHECK_PUSHED * astray)
+        self._begin_at(stands)
+        self._wanted = float(np.copysign(sizes[k], axes.centre[k] - start[k]))
         self._rest = max(2, round(CHECK_REST / cycle_time))
         there = smooth_move(
             self._wanted,
@@ -123,11 +147,10 @@ class _DirectionCheck:
         rest, away = np.zeros(self._rest), np.full(self._rest, self._wanted)
         self._path = np.concatenate([rest, there, away, self._wanted - there, rest])
         if nudge:
-            self._path, self._wanted = CHECK_NUDGE * self._path, CHECK_NUDGE * self._wanted
+            share = float(nudges[k] / sizes[k])
+            self._path, self._wanted = share * self._path, share * self._wanted
         self._done = 0
-        travel = np.array([one.travel[1] - one.travel[0] for one in axes.limits])
-        errors = np.array([one.following_error for one in axes.limits])
-        self._allowed = np.maximum(CHECK_ASTRAY * travel, CHECK_ASTRAY_ERROR * errors)
+        self._mark = stands - start
         self._waiting = k > 0 or not nudge
         self._waited = self._still = 0
         self._still_rows = round(STILL_TIME / cycle_time)
@@ -148,26 +171,38 @@ class _DirectionCheck:
         targets[:, self._k] += part
         return targets
 
+    def _begin_at(self, stands: FloatArray) -> None:
+        """Judge from here, as distances from the very first start, and never from beyond reach."""
+        self._offset = np.clip(stands - self._start, -self._reach, self._reach)
+
     def _watch(self, capture: Capture) -> None:
         moved = capture.position[-1] - self._start
         pushed = not self._nudge and (self._waiting or self._done > self._rest)
         for j, name in enumerate(self._axes.names):
             allowed = float(self._allowed[j])
             if self._done > self._rest and j == self._k:
-                self._follow(name, float(moved[j]), allowed)
+                self._follow(name, float(moved[j]), float(self._offset[j]), allowed)
             else:
                 most = allowed * (CHECK_PUSHED if pushed else 1.0)
-                self._stay(name, float(moved[j]), most, self._axes.unit(j))
-        quiet = bool(np.all(np.abs(moved) < CHECK_QUIET * self._allowed))
-        self._still = self._still + CHECK_SLICE if quiet else 0
+                self._stay(name, float(moved[j]), float(self._offset[j]), most, self._axes.unit(j))
+        if self._waiting:
+            self._wait(moved)
+
+    def _wait(self, moved: FloatArray) -> None:
+        """End the wait when all axes have stood for long enough, wherever that is."""
+        self._still += CHECK_SLICE
+        if np.any(np.abs(moved - self._mark) >= CHECK_QUIET * self._allowed):
+            self._mark, self._still = moved, 0
         if self._still >= self._still_rows or self._waited >= self._longest_wait:
             self._waiting = False
+            self._begin_at(self._start + moved)
 
     @staticmethod
-    def _stay(name: str, moved: float, allowed: float, unit: str) -> None:
-        if abs(moved) > allowed:
+    def _stay(name: str, moved: float, offset: float, allowed: float, unit: str) -> None:
+        """Raise if it left where it stood; back to its first start, where its target is, it may go."""
+        if not min(0.0, offset) - allowed <= moved <= max(0.0, offset) + allowed:
             raise SafetyStopError(
-                f"{name}: moved by {moved:.3g} {unit} while it was told to stand still; its power was "
+                f"{name}: moved by {moved - offset:.3g} {unit} while it was told to stand still; its power was "
                 "cut and all axes were stopped. Either the axis moves the wrong way (check the "
                 "encoder's direction and the motor's phases), or its loop is not stable, or it sags "
                 "when its brake opens.",
@@ -175,24 +210,26 @@ class _DirectionCheck:
                 runaway=True,
             )
 
-    def _follow(self, name: str, moved: float, allowed: float) -> None:
-        forward, unit = moved * np.sign(self._wanted), self._axes.unit(self._k)
-        size = abs(self._wanted)
+    def _follow(self, name: str, moved: float, offset: float, allowed: float) -> None:
+        sign, unit = float(np.sign(self._wanted)), self._axes.unit(self._k)
+        size, slack = abs(self._wanted), float(self._slack[self._k])
+        forward, ahead = sign * moved, sign * offset
         comes_back = self._done > 2 * self._rest + self._rows
-        astray = 0.5 * size if comes_back else allowed  # it may overshoot, there as well as back
-        if forward < -astray or forward > 1.5 * size:
+        # it may overshoot, there as well as back
+        astray = max(0.5 * size + slack, allowed) if comes_back else allowed
+        if forward < min(0.0, ahead) - astray or forward > max(0.0, ahead) + 1.5 * size + slack:
             raise SafetyStopError(
                 f"{name}: moves the wrong way or by itself: {self._wanted:.3g} {unit} was commanded, it "
-                f"moved {moved:.3g} {unit}; its power was cut and all axes were stopped. Check the "
+                f"moved {moved - offset:.3g} {unit}; its power was cut and all axes were stopped. Check the "
                 "encoder's direction and the motor's phases.",
                 axis=name,
                 runaway=True,
             )
         half_way = self._rest + self._rows // 2 <= self._done < self._rest + self._rows
-        if half_way and not self._nudge and forward < CHECK_STARTED * size:
+        if half_way and not self._nudge and forward - ahead < CHECK_STARTED * size:
             raise SafetyStopError(
                 f"{name}: does not follow: half of {self._wanted:.3g} {unit} was commanded, it moved "
-                f"{moved:.3g} {unit}; its power was cut and all axes were stopped. Is it blocked or "
+                f"{moved - offset:.3g} {unit}; its power was cut and all axes were stopped. Is it blocked or "
                 "its brake closed, or does the encoder not count?",
                 axis=name,
                 runaway=True,
@@ -204,7 +241,8 @@ class _DirectionCheck:
         position, torque = capture.position[self._waited :, k], capture.torque[self._waited :, k]
         moved = float(position[2 * self._rest + self._rows - 1] - position[0])
         unit = self._axes.unit(k)
-        if not 0.5 < moved / wanted < 1.5:
+        slack = float(self._slack[k]) / abs(wanted)
+        if not 0.5 - slack < moved / wanted < 1.5 + slack:
             raise SafetyStopError(
                 f"{name}: does not follow: {wanted:.3g} {unit} was commanded, it moved {moved:.3g} "
                 f"{unit}; all axes were stopped. Is it blocked or its brake closed, or is the "

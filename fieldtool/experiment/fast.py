@@ -253,7 +253,8 @@ def with_bias(
     factor = 1.0
     for _ in range(ROUNDS):  # a weaker excitation leaves more of the travel
         highest = (BIAS_SHARE * room - 2 * factor * peaks[0])[chosen] / seconds
-        highest = np.minimum(highest, BIAS_SHARE * allowed_peaks(setting)[1][chosen])
+        fastest = BIAS_SHARE * allowed_peaks(setting)[1][chosen] - factor * peaks[1][chosen]
+        highest = np.minimum(highest, fastest)
         factor = float(min(1.0, np.min(highest / (BIAS_MARGIN * peaks[1][chosen]))))
         if factor < LEAST_FACTOR:
             return None

@@ -157,6 +157,6 @@ def check_peaks(what_moves: str, peaks: FloatArray, setting: Setting) -> None:
             if value > limit:
                 raise PlanRefusedError(
                     f"{what_moves}: {name} would {what} {value:.4g} {in_unit}, its limit is "
-                    f"{limit:.4g} {in_unit}. Nothing was moved. Widen the limit if the machine allows "
-                    "it, or correct the prior model."
+                    f"{limit:.4g} {in_unit}. Nothing of it was moved. Widen the limit if the machine "
+                    "allows it, or correct the prior model."
                 )

@@ -201,8 +201,8 @@ def _stable_loop(setting: Setting) -> ClosedLoop:
     if not loop.stable:
         raise PlanRefusedError(
             "multisine plan: with the model at hand and the gains in the drives the loops are not "
-            "stable. Nothing was moved. Check the prior model in the machine profile and the drives' "
-            "gains."
+            "stable. Nothing of it was moved. Check the prior model in the machine profile and the "
+            "drives' gains."
         )
     return loop
 
@@ -234,5 +234,5 @@ def _bias_too_fast(
         f"experiment {experiment.name}: the bias velocity of "
         f"{experiment.bias[k]:.4g} {length}/s of {setting.model.names[k]} alone comes to a "
         f"{_WHAT[what]} of {taken[what, k]:.4g} {unit}, {allowed[what, k]:.4g} {unit} are allowed for "
-        "all. Nothing was moved. Plan a smaller bias velocity or fewer periods."
+        "all. Nothing of it was moved. Plan a smaller bias velocity or fewer periods."
     )

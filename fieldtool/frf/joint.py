@@ -36,6 +36,8 @@ from fieldtool.frf.phasors import ComplexArray, FloatArray, Phasors
 from fieldtool.frf.response import FrequencyResponse
 from fieldtool.records.recorded import Experiment, Recording
 
+_TOO_MUCH = 0.3
+"""Share of transients in a signal that is worth a word."""
 _CLEAR = 5.0
 """Weakest direction of the torques over its noise, below it a line is left out."""
 
@@ -118,10 +120,10 @@ def _chosen(recording: Recording) -> list[Experiment]:
 def _notes(measured: Sequence[LinePhasors], left_out: int) -> list[str]:
     notes = []
     largest = max(one.transient for one in measured)
-    if largest > 0.001:
+    if largest > _TOO_MUCH and not any(_drifts(one.given.experiment) for one in measured):
         notes.append(
-            f"Transients of up to {100 * largest:.2g} % of the signals were taken out; a longer "
-            "settling time would lessen them."
+            f"Transients of up to {100 * largest:.0f} % of the signals were taken out: the intervals "
+            "are wider for it. More time (--time) would lessen them."
         )
     if left_out:
         notes.append(
@@ -129,6 +131,14 @@ def _notes(measured: Sequence[LinePhasors], left_out: int) -> list[str]:
             "stand out of the noise in every direction, or too few experiments excite them."
         )
     return notes
+
+
+def _drifts(experiment: Experiment) -> bool:
+    """Whether an axis ends far from where it began: a constant velocity is no transient."""
+    quarter = experiment.samples // 4
+    first, last = experiment.position[:quarter], experiment.position[-quarter:]
+    moved = np.abs(last.mean(axis=0) - first.mean(axis=0))
+    return bool(np.any(moved > np.ptp(first, axis=0)))
 
 
 def solve_set(members: Sequence[LinePhasors], axes: tuple[str, ...]) -> SetResponse:

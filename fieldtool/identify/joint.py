@@ -5,7 +5,8 @@ where a maximum likelihood fit to positions and torques of all experiments begin
 error holds whatever the controllers did; what it leaves is compared with the noise.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from math import sqrt
 
@@ -21,8 +22,10 @@ from fieldtool.frf.response import FrequencyResponse
 from fieldtool.identify.block_reduction import BlockReduced, reduce_blocks
 from fieldtool.identify.friction_left import DryFriction, dry_friction, without_dry_friction
 from fieldtool.identify.joint_data import frequencies_of, joint_spectra
+from fieldtool.identify.joint_records import check_alive, moving_on, settled, with_periods
 from fieldtool.identify.modal_chain import reduce_modes
 from fieldtool.identify.modal_model import ModalModel
+from fieldtool.identify.mode_search import find_modes
 from fieldtool.identify.modes import fit_modes
 from fieldtool.identify.order import OrderSelection, select_order
 from fieldtool.identify.refine import RefinedModel, machine_response, refine
@@ -34,6 +37,8 @@ WEIGHTINGS = 2
 """Fits, each weighted with the response of the one before."""
 SEEN = 5.0
 """Standard errors from which dry friction is taken off, and a delay is reported."""
+DELAY_SHARE = 0.05
+"""Of the sample period: a smaller delay between torque and position is one of sampling, no effect."""
 FRICTION_ROUNDS = 3
 """Of estimating dry friction and fitting without it."""
 SIGNIFICANT = 3.0
@@ -42,6 +47,10 @@ DISAGREEMENT = 5.0
 """Standard errors between two ways to one number above which a note is made."""
 WORTH = 25.0
 """By so much chi2 has to fall for each axis' friction at its last mass to be believed."""
+BENT = 0.01
+"""Distortion over torque from which it is said with an error: chains without friction show none."""
+MOST_UNEXPLAINED = 0.3
+"""Share of the motion that may be left unexplained."""
 UNEXPLAINED = 1.5
 """Misfit over noise above which a note is made."""
 
@@ -92,26 +101,30 @@ def identify_joint(
     IdentificationError
         If no machine of chains explains the data.
     """
-    complete, single = _sets(recording)
-    measured = joint_response(recording, complete)
-    phasors = (*measured.phasors, *phasors_of(recording, single))
+    recording = with_periods(recording)
+    check_alive(recording)
+    used = moving_on(recording)
+    complete, single = _sets(used)
+    measured = joint_response(used, complete)
+    phasors = (*measured.phasors, *phasors_of(used, single))
     data = matrix_of(measured.response)
     notes = list(measured.notes)
     order: OrderSelection | None = None
-    if all(name in masses for name in recording.names):
-        modal, start = _known_order(data, masses, kinds, prior, notes)
-    else:
-        order = _chosen_order(data, masses, kinds, prior, notes)
-        if order is not None:
-            modal, start = order.modal, order.model
+    with _told_of_distortion(measured):
+        if all(name in masses for name in recording.names):
+            modal, start = _known_order(data, masses, kinds, prior, notes)
         else:
-            last = {axis.name: len(axis.masses) for axis in prior.axes} if prior else {}
-            modal, start = _known_order(data, {**last, **masses}, kinds, prior, notes)
-    experiments = tuple(recording.experiment(one.experiment) for one in phasors)
-    priors = {f"{name}.mass[1]": mass for name, mass in (motor_masses or {}).items()}
-    fit = _Fit(phasors, experiments, recording.sample_period, priors)
-    first = refine(_still_loads(start), data, fit_delay=True, fit_friction=True, priors=priors)
-    fitted, friction = fit.run(first)
+            order = _chosen_order(data, masses, kinds, prior, notes)
+            if order is not None:
+                modal, start = order.modal, order.model
+            else:
+                last = {axis.name: len(axis.masses) for axis in prior.axes} if prior else {}
+                modal, start = _known_order(data, {**last, **masses}, kinds, prior, notes)
+        priors = {f"{name}.mass[1]": mass for name, mass in (motor_masses or {}).items()}
+        fit = _Fit(phasors, recording, priors)
+        first = refine(_still_loads(start), data, fit_delay=True, fit_friction=True, priors=priors)
+        fitted, friction = fit.run(first)
+    _check_explained(fit.unexplained(fitted), friction)
     notes += [unknown.reason for unknown in fitted.unknown]
     notes += _friction_notes(friction, recording)
     notes += _misfit_note(fitted)
@@ -126,6 +139,27 @@ def identify_joint(
         friction=friction,
         notes=tuple(dict.fromkeys(notes)),
     )
+
+
+@contextmanager
+def _told_of_distortion(measured: JointResult) -> Iterator[None]:
+    """Add to an error that the data are not those of a straight machine, where they show it."""
+    try:
+        yield
+    except IdentificationError as error:
+        seen = [
+            f"{one.axis} ({20 * np.log10(max(one.odd_share, one.even_share)):.0f} dB of its torque)"
+            for one in measured.distortion
+            if max(one.odd_share, one.even_share) > BENT
+        ]
+        if seen:
+            error.add_note(
+                f"The data are strongly non-linear, which may be the cause: distortion of "
+                f"{', '.join(dict.fromkeys(seen))}, likely dry friction or backlash. Give the numbers "
+                "of masses with --masses AXIS=N (dry friction is then taken off), or measure with a "
+                "larger amplitude or on top of a constant velocity, and check the axis for play."
+            )
+        raise
 
 
 def matrix_of(response: FrequencyResponse) -> ResponseMatrix:
@@ -182,7 +216,7 @@ def _known_order(
     """Return modes and chains of known lengths; the prior's numbers where the chains fail."""
     modes = sum(masses[name] - 1 for name in data.names)
     same = prior is not None and all(len(axis.masses) == masses[axis.name] for axis in prior.axes)
-    modal = fit_modes(data, modes, fit_friction=True, fit_delay=True, prior=prior if same else None)
+    modal = _modes(data, modes, prior if same else None)
     try:
         reduced = reduce_blocks(modal, masses, kinds)
     except IdentificationError as error:
@@ -192,6 +226,14 @@ def _known_order(
         return modal, prior
     notes += _structure_notes(reduced)
     return modal, reduced.model
+
+
+def _modes(data: ResponseMatrix, modes: int, prior: MachineModel | None) -> ModalModel:
+    """Fit so many modes; a search that adds one after the other finds many of them more surely."""
+    found = find_modes(data, modes, prior=prior).modal
+    if found.omega.size == modes:
+        return found
+    return fit_modes(data, modes, fit_friction=True, fit_delay=True, prior=prior)
 
 
 def _chosen_order(
@@ -241,12 +283,14 @@ class _Fit:
     def __init__(
         self,
         phasors: Sequence[Phasors],
-        experiments: Sequence[Experiment],
-        sample_period: float,
+        recording: Recording,
         priors: Mapping[str, Estimate],
     ) -> None:
-        self._phasors, self._experiments = phasors, experiments
-        self._step, self._priors = sample_period, priors
+        """`phasors`: what is fitted; dry friction comes from all multisines of the recording."""
+        self._phasors, self._priors = phasors, priors
+        self._step = recording.sample_period
+        everything = (e for e in recording.experiments if e.kind == "multisine" and e.complete)
+        self._settled = {one.name: settled(one, self._step) for one in everything}
         self._omega = frequencies_of(phasors)
 
     def run(self, start: RefinedModel) -> tuple[RefinedModel, DryFriction]:
@@ -259,16 +303,23 @@ class _Fit:
             if not seen:
                 break
             taken[list(seen)] = [friction.torque[k].value for k in seen]
-            freed = without_dry_friction(
-                self._phasors, self._experiments, self._step, taken.tolist()
-            )
+            fitted_ones = [self._settled[one.experiment] for one in self._phasors]
+            freed = without_dry_friction(self._phasors, fitted_ones, self._step, taken.tolist())
             fitted = self._weighted(fitted, freed)
             friction = self._friction(fitted)
         return fitted, friction
 
+    def unexplained(self, fitted: RefinedModel) -> float:
+        """Return the share of the motion, in standard errors, that the machine does not explain."""
+        response = machine_response(fitted.model, self._omega, _delays(fitted))
+        data = joint_spectra(self._phasors, response)
+        left, moved = data.residuals(response), data.residuals(np.zeros_like(response))
+        return float(np.linalg.norm(left) / np.linalg.norm(moved))
+
     def _friction(self, fitted: RefinedModel) -> DryFriction:
         band = (float(self._omega[0] / (2 * np.pi)), float(self._omega[-1] / (2 * np.pi)))
-        return dry_friction(self._experiments, self._step, band, fitted.model, _delays(fitted))
+        settled_ones = list(self._settled.values())
+        return dry_friction(settled_ones, self._step, band, fitted.model, _delays(fitted))
 
     def _weighted(self, start: RefinedModel, phasors: Sequence[Phasors]) -> RefinedModel:
         """Fit, each time weighted anew, then once more without friction that is not seen."""
@@ -342,6 +393,19 @@ def _friction_notes(friction: DryFriction, recording: Recording) -> list[str]:
     return notes
 
 
+def _check_explained(share: float, friction: DryFriction) -> None:
+    """Refuse a machine that does not explain most of what was measured."""
+    if share > MOST_UNEXPLAINED:
+        rubs = [friction.axes[k] for k in friction.seen(SEEN)]
+        why = f"dry friction of {', '.join(rubs)}, " if rubs else ""
+        raise IdentificationError(
+            f"the nearest machine of such chains leaves {100 * share:.0f} % of the motion unexplained "
+            f"(limit {100 * MOST_UNEXPLAINED:.0f} %), so its masses and springs mean nothing: {why}"
+            "another number of masses (--masses AXIS=N), or an axis that does not report its own "
+            "torque? Look at the responses in frequency-response.h5, or use the classic plan."
+        )
+
+
 def _misfit_note(fitted: RefinedModel) -> list[str]:
     misfit = sqrt(fitted.chi2 / fitted.degrees_of_freedom)
     if misfit <= UNEXPLAINED:
@@ -381,7 +445,7 @@ def _with_effects(
     """Put delays and dry friction that are seen among the model's effects."""
     effects = list(fitted.model.effects)
     for axis, delay in zip(fitted.model.axes, fitted.delays, strict=True):
-        if abs(delay.value) > SEEN * delay.std:
+        if abs(delay.value) > max(SEEN * delay.std, DELAY_SHARE * recording.sample_period):
             effects.append(_effect("measurement_delay", axis.name, "delay", delay, "s"))
     for k in friction.seen(SEEN):
         unit = recording.axes[k].torque_unit

@@ -11,14 +11,19 @@ Two axes that are coupled with each other and with no third one are a special ca
 chains and the coupling are one path from motor to motor, and every split of its springs between
 the axes is a machine with positive masses that moves both motors alike, dampers included (with
 last masses a, b and coupling c, the other's last spring K is seen as (c/b)**2 K behind mass a).
-Only friction at a load tells them apart.  What can not be told is said, and the machine whose
-masses and springs are most alike is taken.
+Only friction at a load tells them apart.  What can not be told is said.  Of machines that explain
+the responses about equally well, ten units of the criterion are no more than errors of the method:
+the prior model's lengths are taken, else the fewest masses, else the motor masses nearest to the
+prior's, else masses and springs most alike.
+
+The lengths of the prior model and a machine of rigid axes are tried whatever modes were found: a
+joint with strong damping hardly has a mode, and errors of the method may look like some.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
-from math import inf, isfinite, log, pi, sqrt
+from itertools import combinations, product
+from math import inf, isfinite, log, nan, pi, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,12 +36,15 @@ from fieldtool.identify.mode_search import (
     ModeSearch,
     find_modes,
     standing_out,
+    with_modes,
     with_strongest_hint,
     without_mode,
 )
-from fieldtool.identify.refine import RefinedModel, refine
+from fieldtool.identify.mode_search import criterion as modal_criterion
+from fieldtool.identify.modes import prior_poles
+from fieldtool.identify.refine import UNKNOWN_ABOVE, RefinedModel, refine
 from fieldtool.identify.response_data import ResponseMatrix
-from fieldtool.records.model import AxisModel, Estimate, Kind, MachineModel
+from fieldtool.records.model import AxisModel, Coupling, Estimate, Kind, MachineModel
 
 FloatArray = NDArray[np.float64]
 REDUCED = 24
@@ -51,6 +59,10 @@ UNEXPLAINED = 100.0
 """Misfit over noise above which no model is accepted: errors ten times the noise."""
 FAR = 4.0
 """Misfit over noise above which the model is called doubtful though nothing is better."""
+ALIKE = 0.05
+"""Difference of motor masses from the prior's, relative, that tells no machine from another."""
+SUNK = 3.0
+"""Standard errors below which a mode that is left out is noise, and not mentioned."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +76,8 @@ class Candidate:
     difference: float
     """Schwarz' criterion above that of the best; infinite if not refined."""
     accepted: bool
-    """Whether it explains the responses as well as free modes do."""
+    """Whether it explains the responses as well as free modes do, and all its masses and springs
+    are known."""
     why: str
     """One sentence."""
 
@@ -111,7 +124,8 @@ def select_order(
     known : mapping of axis name to N, optional
         Axes whose number of masses is known.
     prior : MachineModel, optional
-        Same axes; its poles are one more start.
+        Same axes; its poles are one more start, its lengths are tried in any case, and with its
+        motor masses it decides between machines that explain the responses equally well.
     longest : int
         Masses of the longest chain in question.
 
@@ -122,25 +136,60 @@ def select_order(
     NotEnoughDataError
         If a pair of axes was not measured or there are too few lines.
     IdentificationError
-        If no machine of chains explains the responses; the sentence says what comes closest.
+        If no machine of chains whose masses and springs are all known explains the responses; the
+        sentence says what comes closest.
     """
     given = dict(known or {})
     choices = _choices(data.names, given, longest)
     most = sum(c[-1] - 1 for c in choices)
     search = find_modes(data, most, prior=prior)
-    trials = _trials(data, kinds or {}, choices, search)
+    trials = _simple_trials(data, kinds or {}, choices, search, prior)
+    trials += _trials(data, kinds or {}, choices, search, trials)
     if not any(t.accepted for t in trials):
         raise _nothing_fits(data.names, search, trials, most)
-    return _selection(data, search, trials, _best(trials, prior))
+    best, decided = _best(trials, prior)
+    return _selection(data, search, trials, best, decided)
 
 
-def _best(trials: "Sequence[_Trial]", prior: MachineModel | None) -> "_Trial":
-    """The best by the criterion; of those that it can not tell apart, the prior's or most even."""
-    accepted = [t for t in trials if t.accepted]
-    lowest = min(t.criterion for t in accepted)
-    near = [t for t in accepted if t.criterion < lowest + DECISIVE]
-    lengths = tuple(len(axis.masses) for axis in prior.axes) if prior is not None else ()
-    return min(near, key=lambda t: (t.lengths != lengths, t.criterion + t.unevenness))
+def _best(trials: "Sequence[_Trial]", prior: MachineModel | None) -> "tuple[_Trial, str]":
+    """The best of those that the responses can not tell apart, and what decided between them."""
+    near = _near(trials)
+    decided = ""
+    lengths = _lengths(prior) if prior is not None else ()
+    fewest = min(sum(t.lengths) for t in near)
+    for kept, why in (
+        ([t for t in near if t.lengths == lengths], "the prior model's lengths were taken"),
+        ([t for t in near if sum(t.lengths) == fewest], "the fewest masses were taken"),
+    ):
+        if kept and len(kept) < len(near):
+            near, decided = kept, why
+        if decided and len(near) == 1:
+            return near[0], decided
+    if prior is not None:
+        off = [t.motors_off(prior) for t in near]
+        kept = [t for t, each in zip(near, off, strict=True) if each <= min(off) + ALIKE]
+        if len(kept) < len(near):
+            near, decided = kept, "the motor masses of the prior model decided"
+    if len(near) > 1:
+        also = " first" if decided.startswith("the motor") else ""
+        even = "the most even masses and springs were taken"
+        decided = f"{decided}{also}, then {even}" if also else even
+    return min(near, key=lambda t: t.unevenness), decided
+
+
+def _near(trials: "Sequence[_Trial]") -> "list[_Trial]":
+    """Accepted machines that the criterion can not tell from the best, each lengths once."""
+    best_of: dict[tuple[int, ...], _Trial] = {}
+    for trial in sorted(trials, key=lambda t: t.criterion):
+        if trial.accepted:
+            best_of.setdefault(trial.lengths, trial)
+    accepted = list(best_of.values())
+    limit = accepted[0].criterion + DECISIVE * max(accepted[0].excess, 1.0)
+    return [t for t in accepted if t.criterion < limit]
+
+
+def _lengths(model: MachineModel) -> tuple[int, ...]:
+    return tuple(len(axis.masses) for axis in model.axes)
 
 
 def _choices(names: Sequence[str], known: Mapping[str, int], longest: int) -> list[tuple[int, ...]]:
@@ -169,6 +218,18 @@ class _Trial:
     why: str
 
     @property
+    def excess(self) -> float:
+        """Chi2 over its degrees of freedom; NaN if not refined."""
+        return self.refined.chi2 / self.refined.degrees_of_freedom if self.refined else nan
+
+    def motors_off(self, prior: MachineModel) -> float:
+        """Largest relative difference of a motor mass from the prior's."""
+        if self.refined is None:
+            return inf
+        pairs = zip(self.refined.model.axes, prior.axes, strict=True)
+        return max(abs(a.masses[0].value / b.masses[0].value - 1.0) for a, b in pairs)
+
+    @property
     def structure(self) -> float:
         """Misfit of the structure, like chi2; what orders the trials before refinement."""
         return inf if self.reduced is None else self.reduced.misfit
@@ -187,26 +248,76 @@ class _Trial:
         return total
 
 
+def _simple_trials(
+    data: ResponseMatrix,
+    kinds: Mapping[str, Kind],
+    choices: Sequence[tuple[int, ...]],
+    search: ModeSearch,
+    prior: MachineModel | None,
+) -> list[_Trial]:
+    """The prior model's lengths and a machine of rigid axes, whatever modes were found."""
+    starts = []
+    if prior is not None and prior.names == data.names:
+        starts.append(_all_coupled(prior))
+    rigid = (1,) * len(choices)
+    if rigid not in [_lengths(start) for start in starts]:
+        starts.append(_rigid_machine(search.modal, kinds))
+    return [
+        _from_machine(data, kinds, start, search.modal)
+        for start in starts
+        if all(n in given for n, given in zip(_lengths(start), choices, strict=True))
+    ]
+
+
+def _from_machine(
+    data: ResponseMatrix, kinds: Mapping[str, Kind], start: MachineModel, free: ModalModel
+) -> _Trial:
+    """Refine a machine, fit its modes from its own poles, and refine again what those say.
+
+    It is measured by the free modes that were found, which may be more than its own.
+    """
+    lengths = _lengths(start)
+    trial = _refined(data, _Trial(lengths, free, None, None, inf, False, ""), start)
+    count = sum(lengths) - len(lengths)
+    poles = prior_poles(start if trial.refined is None else trial.refined.model, count)
+    if poles.size < count or data.count <= replace(free.parts, modes=count).count:
+        return trial
+    try:
+        with np.errstate(all="ignore"):
+            modal = with_modes(data, replace(free.parts, modes=count), poles)
+    except np.linalg.LinAlgError:
+        return trial
+    reduced = _reduced(modal, kinds, lengths)
+    trial = replace(trial, modal=modal, reduced=reduced.reduced)
+    if trial.accepted or reduced.reduced is None:
+        return trial
+    again = _refined(data, trial, reduced.reduced.model, free)
+    return again if again.criterion < trial.criterion else trial
+
+
 def _trials(
     data: ResponseMatrix,
     kinds: Mapping[str, Kind],
     choices: Sequence[tuple[int, ...]],
     search: ModeSearch,
+    others: Sequence[_Trial],
 ) -> list[_Trial]:
-    """Try the modes that were found; one less or more where that is in doubt.
+    """Try the modes that were found; less or one more where that is in doubt.
 
-    Less where the faintest is hardly seen, more where the structure tells that one is missing.
+    Less where the faintest is hardly seen, more where the structure tells that one is missing and
+    none of the `others` was accepted.
     """
     trials = _of_modes(data, kinds, choices, search.modal)
-    if standing_out(search.modal).min(initial=inf) < SEEN:
-        fewer = without_mode(data, search.modal)
+    fewer: ModalModel | None = search.modal
+    while fewer is not None and standing_out(fewer).min(initial=inf) < SEEN:
+        fewer = without_mode(data, fewer)
         if fewer is not None:
             trials += _of_modes(data, kinds, choices, fewer)
-    if not any(t.accepted for t in trials):
+    if not any(t.accepted for t in (*trials, *others)):
         more = with_strongest_hint(data, search.modal)
         if more is not None:
             trials += _of_modes(data, kinds, choices, more)
-    if not any(t.accepted for t in trials):
+    if not any(t.accepted for t in (*trials, *others)):
         trials = _in_need(data, kinds, trials)
     return trials
 
@@ -264,15 +375,17 @@ def _reduced(modal: ModalModel, kinds: Mapping[str, Kind], lengths: tuple[int, .
     return _Trial(lengths, modal, reduced, None, inf, False, why)
 
 
-def _refined(data: ResponseMatrix, trial: _Trial, start: MachineModel) -> _Trial:
-    modal = trial.modal
-    delay = modal.parts.delay
+def _refined(
+    data: ResponseMatrix, trial: _Trial, start: MachineModel, free: ModalModel | None = None
+) -> _Trial:
+    """The trial refined; accepted if as good as free modes, its own where no others are given."""
+    modal = free or trial.modal
     try:
         with np.errstate(all="ignore"):  # a start from afar may go astray, which chi2 tells
             found = refine(
                 start,
                 data,
-                fit_delay=delay,
+                fit_delay=modal.parts.delay,
                 fit_friction=True,
                 fit_load_friction=True,
                 delays=[float(d) for d in modal.delays],
@@ -281,12 +394,27 @@ def _refined(data: ResponseMatrix, trial: _Trial, start: MachineModel) -> _Trial
         return replace(trial, why=f"can not be refined: {error}")
     price = len(found.names) * log(max(data.count, 2))
     limit = min(_acceptable(modal, found), UNEXPLAINED * found.degrees_of_freedom)
-    accepted = found.chi2 <= limit
     excess = found.chi2 / found.degrees_of_freedom
     why = f"misfit {excess:.3g} times the noise, free modes {modal.excess:.3g}"
-    if not accepted:
+    unknown = _not_known(found.model)
+    explains = found.chi2 <= limit
+    if not explains:
         why += ": chains of these lengths do not explain the responses"
+    elif unknown:
+        why += f", but the responses do not tell {', '.join(unknown)}"
+    accepted = explains and not unknown
     return replace(trial, refined=found, criterion=found.chi2 + price, accepted=accepted, why=why)
+
+
+def _not_known(model: MachineModel) -> list[str]:
+    """Masses and springs whose standard error is half of them or more."""
+    named = [
+        (f"{axis.name} {what} {k}", each)
+        for axis in model.axes
+        for what, chain in (("mass", axis.masses), ("spring", axis.springs))
+        for k, each in enumerate(chain, start=1)
+    ]
+    return [name for name, e in named if not e.std < UNKNOWN_ABOVE * e.value]
 
 
 def _acceptable(modal: ModalModel, found: RefinedModel) -> float:
@@ -324,7 +452,11 @@ def _in_need(data: ResponseMatrix, kinds: Mapping[str, Kind], tried: list[_Trial
 
 
 def _selection(
-    data: ResponseMatrix, search: ModeSearch, trials: Sequence[_Trial], best: _Trial
+    data: ResponseMatrix,
+    search: ModeSearch,
+    trials: Sequence[_Trial],
+    best: _Trial,
+    decided: str,
 ) -> OrderSelection:
     ranked = sorted(trials, key=lambda t: (t is not best, not t.accepted, t.criterion, t.structure))
     evidence = tuple(_candidate(t, best) for t in ranked)
@@ -336,7 +468,7 @@ def _selection(
         dict(zip(data.names, best.lengths, strict=True)),
         evidence,
         runner_up,
-        (*_mode_doubts(search, best), *_other_doubts(data, best, trials)),
+        (*_mode_doubts(search, best), *_other_doubts(data, best, trials, decided)),
         best.modal,
         best.refined.model,
         best.refined,
@@ -345,19 +477,20 @@ def _selection(
 
 
 def _candidate(trial: _Trial, best: _Trial) -> Candidate:
-    excess = (
-        trial.refined.chi2 / trial.refined.degrees_of_freedom if trial.refined else float("nan")
-    )
     difference = trial.criterion - best.criterion
-    return Candidate(trial.lengths, excess, difference, trial.accepted, trial.why)
+    return Candidate(trial.lengths, trial.excess, difference, trial.accepted, trial.why)
 
 
 def _mode_doubts(search: ModeSearch, best: _Trial) -> list[str]:
     """Modes that hardly rise out of the noise, are left out, or may be missing."""
+    if max(best.lengths) == 1 and _at_the_noise(search, best):
+        return []
     doubts = []
     larger = max((search.modal, best.modal), key=lambda modal: modal.omega.size)
     for w, seen in zip(larger.omega, standing_out(larger), strict=True):
         left_out = not np.any(np.abs(best.modal.omega - w) < 0.02 * w)
+        if left_out and seen < SUNK:
+            continue
         if seen < SEEN or left_out:
             doubts.append(
                 f"the mode at {w / (2 * pi):.4g} Hz is in doubt: it stands "
@@ -376,30 +509,31 @@ def _mode_doubts(search: ModeSearch, best: _Trial) -> list[str]:
     return doubts
 
 
-def _other_doubts(data: ResponseMatrix, best: _Trial, trials: Sequence[_Trial]) -> list[str]:
+def _at_the_noise(search: ModeSearch, best: _Trial) -> bool:
+    """Whether a machine explains the responses so well that modes beyond it are not worth a word."""
+    unit = max(search.modal.excess, 1.0)
+    return best.excess < FAR and best.criterion < modal_criterion(search.modal) + DECISIVE * unit
+
+
+def _other_doubts(
+    data: ResponseMatrix, best: _Trial, trials: Sequence[_Trial], decided: str
+) -> list[str]:
     """Other lengths that explain the responses nearly as well, and a large misfit."""
     doubts = []
-    rivals = [
-        t
-        for t in trials
-        if t is not best and t.accepted and t.criterion < best.criterion + DECISIVE
-    ]
+    rivals = [t for t in _near(trials) if t.lengths != best.lengths]
     if rivals:
         listed = "; or ".join(_listed(data.names, t.lengths) for t in rivals)
         nearest = min(t.criterion for t in rivals) - best.criterion
         doubts.append(
             f"the responses can hardly tell the masses {_listed(data.names, best.lengths)} from "
-            f"{listed} (criterion {nearest:+.2g}, {DECISIVE:.0f} are decisive); the most likely "
-            "with even masses and springs was taken; give the number of masses of an axis where "
-            "it is known"
+            f"{listed} (criterion {nearest:+.2g}, {DECISIVE:.0f} are decisive): {decided}; give the "
+            "number of masses of an axis where it is known"
         )
-    if best.refined is not None:
-        excess = best.refined.chi2 / best.refined.degrees_of_freedom
-        if excess > FAR:
-            doubts.append(
-                f"the misfit is {excess:.3g} times the noise: something is not linear or changes "
-                "with time, or the noise is larger than stated; standard errors are enlarged by it"
-            )
+    if best.excess > FAR:
+        doubts.append(
+            f"the misfit is {best.excess:.3g} times the noise: something is not linear or changes "
+            "with time, or the noise is larger than stated; standard errors are enlarged by it"
+        )
     return doubts
 
 
@@ -424,8 +558,10 @@ def _nothing_fits(
     nearest = min(trials, key=lambda t: (t.criterion, t.structure))
     notes = nearest.reduced.notes if nearest.reduced is not None else ()
     detail = f"; {notes[0]}" if notes else ""
+    unknown = nearest.refined is not None and _not_known(nearest.refined.model)
     return IdentificationError(
-        f"{found}, but no machine of chains that are coupled at their last masses explains them; "
+        f"{found}, but no machine of chains that are coupled at their last masses explains them"
+        f"{' with all masses and springs known' if unknown else ''}; "
         f"closest are the masses {_listed(names, nearest.lengths)}: {nearest.why}{detail}"
     )
 
@@ -448,3 +584,35 @@ def typical_machine(
             )
         )
     return MachineModel(tuple(axes))
+
+
+def _rigid_machine(modal: ModalModel, kinds: Mapping[str, Kind]) -> MachineModel:
+    """Axes of one mass each, with the couplings of the measured rigid body."""
+    mass = np.linalg.pinv(modal.rigid, hermitian=True)
+    diagonal = np.diag(mass)
+    if not (diagonal > 0.0).all():
+        return _all_coupled(typical_machine(modal, (1,) * len(modal.names), kinds))
+    axes = [
+        AxisModel(name, kinds.get(name, "rotary"), (Estimate(float(each)),), ())
+        for name, each in zip(modal.names, diagonal, strict=True)
+    ]
+    values = {
+        (modal.names[i], modal.names[j]): float(mass[i, j])
+        for i, j in zip(*np.triu_indices(len(axes), 1), strict=True)
+    }
+    couplings = tuple(Coupling(pair, value) for pair, value in values.items())
+    coupled = MachineModel(tuple(axes), couplings)
+    if np.linalg.eigvalsh(coupled.mass_matrix)[0] <= 0.0:
+        return _all_coupled(MachineModel(tuple(axes)))
+    return coupled
+
+
+def _all_coupled(model: MachineModel) -> MachineModel:
+    """The model with the couplings that it does not list, from zero."""
+    listed = {frozenset(coupling.axes) for coupling in model.couplings}
+    missing = tuple(
+        Coupling((one, other), 0.0)
+        for one, other in combinations(model.names, 2)
+        if frozenset((one, other)) not in listed
+    )
+    return replace(model, couplings=(*model.couplings, *missing))

@@ -9,9 +9,11 @@ from scipy.optimize import nnls
 from fieldtool.errors import IdentificationError, NotEnoughDataError
 from fieldtool.frf.phasors import Phasors
 from fieldtool.identify.expected import Noise
-from fieldtool.identify.friction_left import DryFriction, dry_friction
+from fieldtool.identify.forward import spectra
+from fieldtool.identify.friction_left import DryFriction, dry_friction, without_dry_friction
 from fieldtool.identify.joint import phasors_of
 from fieldtool.identify.joint_data import frequencies_of, joint_spectra
+from fieldtool.identify.joint_records import settled, with_periods
 from fieldtool.identify.refine import RefinedModel, machine_response, refine
 from fieldtool.records.model import Estimate, FloatArray, MachineModel
 from fieldtool.records.recording import Experiment, Recording
@@ -22,8 +24,17 @@ WEIGHTINGS = 2
 """Fits, each weighted with the response of the one before."""
 POOR_FIT = 30.0
 """Misfit over noise above which the pilot's model is not used."""
+BEYOND = 2.0
+"""Factor by which a mode may lie outside the pilot's lines and still be believed."""
 SMALLEST = 1e-12
 """rad or m: noise of a position that shows none."""
+FRICTION_ROUNDS = 6
+"""Of fitting anew without dry friction, at most."""
+FRICTION_TAKEN = 2.0
+"""Standard errors from which dry friction is taken off before the next fit: a model that was fitted
+with it hides a part of it, and the rest stands out more from one fit to the next."""
+FRICTION_SETTLED = 0.02
+"""Relative change of the friction from one fit to the next, below which no other follows."""
 FRICTION_SEEN = 5.0
 """Standard errors from which dry friction counts as seen."""
 
@@ -56,24 +67,19 @@ def read_pilot(recording: Recording, prior: MachineModel) -> PilotFindings:
     NotEnoughDataError
         If there is no multisine, or nothing moved.
     """
+    recording = with_periods(recording)
     experiments = [e for e in recording.experiments if e.kind == "multisine" and e.complete]
     if not experiments:
         raise NotEnoughDataError("there is no complete multisine experiment to be read as a pilot")
     phasors = phasors_of(recording, experiments)
+    step = recording.sample_period
     notes: list[str] = []
-    fitted = _fitted(phasors, prior, notes)
-    model = prior if fitted is None else fitted.model
-    delays = np.zeros(len(prior.axes))
-    if fitted is not None:
-        delays = np.array([d.value for d in fitted.delays])
-    noise = _noise(phasors, experiments, recording.sample_period, model, delays)
-    if fitted is None:
+    explained = _explained(phasors, experiments, step, prior, notes)
+    if explained is None:
+        noise = _noise(phasors, experiments, step, prior, np.zeros(len(prior.axes)))
         return PilotFindings(prior, noise, None, tuple(notes))
-    band = (
-        min(float(p.frequencies.min()) for p in phasors),
-        max(float(p.frequencies.max()) for p in phasors),
-    )
-    friction = dry_friction(experiments, recording.sample_period, band, fitted.model, delays)
+    fitted, friction = explained
+    noise = _noise(phasors, experiments, step, fitted.model, _delays(fitted))
     for k in friction.seen(FRICTION_SEEN):
         unit = recording.axes[k].torque_unit
         one = friction.torque[k]
@@ -84,6 +90,41 @@ def read_pilot(recording: Recording, prior: MachineModel) -> PilotFindings:
     return PilotFindings(fitted.model, noise, friction, tuple(notes))
 
 
+def _explained(
+    phasors: Sequence[Phasors],
+    experiments: Sequence[Experiment],
+    step: float,
+    prior: MachineModel,
+    notes: list[str],
+) -> tuple[RefinedModel, DryFriction] | None:
+    """Fit a model and dry friction in turn: friction that is likely is taken off before the next fit.
+
+    None where no model explains the pilot; why is added to the notes.
+    """
+    steady = [settled(one, step) for one in experiments]
+    band = (
+        min(float(p.frequencies.min()) for p in phasors),
+        max(float(p.frequencies.max()) for p in phasors),
+    )
+    found: tuple[RefinedModel, DryFriction] | None = None
+    freed, taken, said = phasors, np.zeros(len(prior.axes)), list[str]()
+    for _ in range(1 + FRICTION_ROUNDS):
+        said = []
+        fitted = _fitted(freed, prior, said)
+        if fitted is None:
+            break
+        friction = dry_friction(steady, step, band, fitted.model, _delays(fitted))
+        found = fitted, friction
+        likely = friction.seen(FRICTION_TAKEN)
+        new = np.array([one.value if k in likely else 0.0 for k, one in enumerate(friction.torque)])
+        if np.all(np.abs(new - taken) <= FRICTION_SETTLED * np.abs(new)):
+            break
+        taken = new
+        freed = without_dry_friction(phasors, steady, step, taken.tolist())
+    notes += said
+    return found
+
+
 def measured_noise(recording: Recording, model: MachineModel) -> Noise:
     """Return the noise of single samples that a recording's multisines show.
 
@@ -92,6 +133,7 @@ def measured_noise(recording: Recording, model: MachineModel) -> Noise:
     NotEnoughDataError
         If there is no complete multisine, or none with two whole periods.
     """
+    recording = with_periods(recording)
     experiments = [e for e in recording.experiments if e.kind == "multisine" and e.complete]
     if not experiments:
         raise NotEnoughDataError("there is no complete multisine experiment that tells the noise")
@@ -149,7 +191,7 @@ def _fitted(
                 fit_friction=True,
                 delays=delays.tolist(),
             )
-            model, delays = found.model, np.array([d.value for d in found.delays])
+            model, delays = found.model, _delays(found)
     except IdentificationError as error:
         notes.append(
             f"The pilot can not be explained ({error}); the plan rests on the prior model."
@@ -161,7 +203,23 @@ def _fitted(
             f"The pilot differs from what masses and springs explain by {misfit:.0f} times its noise; "
             "friction, or another number of masses? The plan goes on with the nearest model."
         )
+    if found is not None and not _in_band(found.model, omega):
+        notes.append(
+            "The pilot puts modes far outside its band, so its model is not used; the plan rests on the "
+            "prior model. Another number of masses than the profile says?"
+        )
+        return None
     return found
+
+
+def _in_band(model: MachineModel, omega: FloatArray) -> bool:
+    """Whether all springs' modes lie where the pilot could see them."""
+    try:
+        every = [one.resonances[1:] for one in spectra(model)]
+    except ValueError:
+        return False
+    modes = np.sqrt(np.concatenate([*every, np.zeros(0)]))
+    return bool(np.all((modes > omega[0] / BEYOND) & (modes < BEYOND * omega[-1])))
 
 
 def _trusted(prior: MachineModel) -> dict[str, Estimate]:
@@ -177,3 +235,7 @@ def _trusted(prior: MachineModel) -> dict[str, Estimate]:
                     std = TRUST[kind] * value.value
                     known[f"{axis.name}.{kind}[{k + 1}]"] = Estimate(value.value, std)
     return known
+
+
+def _delays(fitted: RefinedModel) -> FloatArray:
+    return np.array([delay.value for delay in fitted.delays])

@@ -7,12 +7,13 @@ from pathlib import Path
 import numpy as np
 
 from drives.canopen_drive import CanopenGroup, connect
-from drives.errors import UserStopError
+from drives.errors import StoppedError, UserStopError
 from drives.profile import MachineProfile, load_machine
 from fieldtool.experiment.axes import Axes
 from fieldtool.experiment.classic import undamped_modes
 from fieldtool.experiment.directions import check_directions
 from fieldtool.experiment.fast import fast_cycle_times
+from fieldtool.experiment.forecast import Setting
 from fieldtool.experiment.multisine import MultisinePlan
 from fieldtool.experiment.multisine_forecast import experiment_peaks
 from fieldtool.experiment.multisine_runner import run_multisine
@@ -31,10 +32,13 @@ from fieldtool.workflow.planning import (
 )
 from fieldtool.workflow.preparation import axes_of, recording_header, setting_of
 from fieldtool.workflow.session import Options, Screen, Session
+from fieldtool.workflow.stopped import judge_stop
 from fieldtool.writeback.transaction import take_backup
 
 GUESSED_NOISE = 1e-3
 """Of the rated torque: noise of the torque before the pilot has measured it (one count of 0x6077)."""
+TOLERATED = 1.05
+"""Excitation time over what was asked for, above which it is said."""
 LATE_SHARE = 0.01
 """Of the pilot's cycles that may begin late; with more, the next longer cycle is tried."""
 FOLLOWING_ERROR = 4
@@ -81,8 +85,21 @@ def plan(
         )
     planned = replace(main, pilot=pilot)
     if screen is not None:
+        for note in _longer_than_asked(planned, options.excitation_time):
+            screen.say(note)
         screen.fast_plan(planned)
     return planned
+
+
+def _longer_than_asked(planned: PlannedFast, seconds: float | None) -> tuple[str, ...]:
+    """Return a sentence if the plan takes clearly longer than was asked for."""
+    if seconds is None or planned.duration <= TOLERATED * seconds:
+        return ()
+    return (
+        f"{seconds:g} s are too short for this machine: run-in and two periods that are long enough for "
+        f"its slowest motion take {planned.duration:.0f} s in all, the shortest plan there is. That one "
+        "is used.",
+    )
 
 
 def _guessed_noise(group: CanopenGroup) -> Noise:
@@ -101,6 +118,7 @@ class _Measurement:
         self._times = timing(
             self._setting, options.excitation_time or usual_seconds(self._setting.model)
         )
+        self._asked = options.excitation_time
         self._wanted = Wanted()
         self._offsets = group.torque_offsets
         self._axes: Axes = axes_of(group, self._setting)
@@ -141,16 +159,30 @@ class _Measurement:
                 )
                 return None
             session.screen.stage("Measure, pilot: weak, to find noise, friction and modes")
-            seconds = self._run(pilot, keep)
+            seconds = self._run(pilot, self._setting, keep)
             session.screen.stage("Read the pilot, and plan the main experiments")
-            main = self._plan_after(recording.recording, pilot)
+            main, known = self._plan_after(recording.recording, pilot)
             session.screen.stage("Measure, main experiments: all axes at once")
-            return seconds + self._run(main.plan, keep)
+            return seconds + self._run(main.plan, known, keep)
 
-    def _run(self, plan: MultisinePlan, keep: Callable[[Experiment], None]) -> float:
-        errors = experiment_peaks(plan, self._setting)[:, FOLLOWING_ERROR, :]
+    def _run(
+        self, plan: MultisinePlan, setting: Setting, keep: Callable[[Experiment], None]
+    ) -> float:
+        errors = experiment_peaks(plan, setting)[:, FOLLOWING_ERROR, :]
         report = self._session.screen.progress
-        return run_multisine(self._group, plan, self._axes, keep, report, errors)
+        begun: list[Experiment] = []
+
+        def noting(experiment: Experiment) -> None:
+            begun.append(experiment)
+            keep(experiment)
+
+        try:
+            return run_multisine(self._group, plan, self._axes, noting, report, errors)
+        except StoppedError as error:
+            done = sum(one.complete for one in begun)
+            following = plan.experiments[min(done, len(plan.experiments) - 1)].name
+            judge_stop(error, begun, following, self._axes, plan.cycle_time, keep)
+            raise
 
     def _plan_all(self, cycle_time: float) -> MultisinePlan:
         """Plan with the prior model, and show it; nothing has moved yet."""
@@ -161,11 +193,16 @@ class _Measurement:
         main = plan_main(
             self._setting, cycle_time, guess, self._times, self._wanted, SEED + 1, self._offsets
         )
-        screen.fast_plan(replace(main, pilot=pilot))
+        planned = replace(main, pilot=pilot)
+        for note in _longer_than_asked(planned, self._asked):
+            self._session.warn(note)
+        screen.fast_plan(planned)
         return pilot
 
-    def _plan_after(self, recording: Recording, pilot: MultisinePlan) -> PlannedFast:
-        """Plan the main experiments with what the pilot found."""
+    def _plan_after(
+        self, recording: Recording, pilot: MultisinePlan
+    ) -> tuple[PlannedFast, Setting]:
+        """Plan the main experiments with what the pilot found, and return what that is."""
         session = self._session
         found = read_pilot(recording, self._setting.model)
         for note in found.notes:
@@ -185,5 +222,6 @@ class _Measurement:
         main = freed_of_friction(main, now_known, found.noise, found.friction)
         for note in main.plan.notes:
             session.screen.say(note)
+        main = replace(main, rests_on="pilot's model")
         session.screen.fast_plan(main)
-        return main
+        return main, now_known

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from drives.errors import ProfileError
 from drives.profile import MachineProfile
 from fieldtool.errors import PlanRefusedError
 from fieldtool.records.model import AxisModel, Coupling, Estimate, MachineModel
@@ -12,8 +13,30 @@ from fieldtool.workflow.session import Options
 
 
 def prior_model(machine: MachineProfile) -> MachineModel:
-    """Return the machine as last accepted."""
-    return _model([axis.prior for axis in machine.axes], machine.couplings, machine)
+    """Return the machine as last accepted.
+
+    Raises
+    ------
+    ProfileError
+        If its couplings are larger than its last masses allow.
+    """
+    model = _model([axis.prior for axis in machine.axes], machine.couplings, machine)
+    ends = {axis.name: axis.masses[-1].value for axis in model.axes}
+    for coupling in model.couplings:
+        a, b = coupling.axes
+        largest = np.sqrt(ends[a] * ends[b])
+        if abs(coupling.value) >= largest:
+            raise ProfileError(
+                machine.path,
+                f"the coupling {coupling.value:g} of {a} and {b} is more than their last masses allow: "
+                f"it must stay below {largest:.4g}",
+            )
+    if np.linalg.eigvalsh(model.mass_matrix)[0] <= 0:
+        raise ProfileError(
+            machine.path,
+            "the couplings together are more than the last masses allow: make them smaller",
+        )
+    return model
 
 
 def truth_model(machine: MachineProfile) -> MachineModel | None:

@@ -1,6 +1,7 @@
 """What the next measurement of a machine should be, from what a recording has told of it."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -71,7 +72,7 @@ def next_plan(
     seconds = options.excitation_time or usual_seconds(found.model)
     times = timing(setting, seconds)
     planned = plan_main(setting, cycle_time, _noise(recording, found), times, Wanted(), SEED)
-    return found, planned
+    return found, replace(planned, rests_on="identified model")
 
 
 def _loops(recording: Recording, found: Identified) -> tuple[AxisLoop, ...]:

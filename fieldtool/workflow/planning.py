@@ -64,6 +64,8 @@ class PlannedFast:
     moves: tuple[AxisForecast, ...]
     accuracy: Expected
     wanted: Wanted
+    rests_on: str = "machine as last accepted"
+    """Which model it was simulated with, in words."""
     pilot: MultisinePlan | None = None
     """Comes before it; None where it has been run."""
 
@@ -119,7 +121,7 @@ class Timing:
     pilot_experiments: int
     """M, or 1 where the time is short."""
     periods: int
-    """Of each main experiment."""
+    """Of each experiment."""
     seconds_left: float
     """For the main experiments."""
 
@@ -133,13 +135,13 @@ def timing(setting: Setting, seconds: float) -> Timing:
     seconds -= 2 * settle  # pilot and main experiments each end with a fade-out
     least = shortest_period(setting.model)
     for periods in (MORE_PERIODS, PERIODS):
-        longest = (seconds / axes - 2 * settle) / (PERIODS + USUAL * periods)
+        longest = (seconds / axes - 2 * settle) / (periods * (1 + USUAL))
         if longest >= least + ROUND:
             period, count = ROUND * float(np.floor(longest / ROUND)), axes
             break
     else:
         period, count, periods = ROUND * float(np.ceil(least / ROUND)), 1, PERIODS
-    left = float(seconds - count * (settle + PERIODS * period))
+    left = float(seconds - count * (settle + periods * period))
     return Timing(period, count, periods, max(left, axes * (settle + PERIODS * least)))
 
 
@@ -164,6 +166,7 @@ def plan_pilot(
         name="pilot",
         share=PILOT_SHARE,
         offsets=offsets,
+        periods=times.periods,
     )
     forecast_multisine(plan, setting)
     return plan
@@ -246,13 +249,8 @@ def freed_of_friction(
     biased = with_bias(planned.plan, setting, seen)
     if biased is not None:
         plan, factor = biased
-        found = replace(
-            planned,
-            plan=plan,
-            moves=forecast_multisine(plan, setting),
-            accuracy=expected_accuracy(setting.model, excitations(plan, setting), noise),
-        )
-        if found.reached <= 1.0:
+        found = _checked(replace(planned, plan=plan), setting, noise)
+        if found is not None and found.reached <= 1.0:
             note = (
                 f"{names}: dry friction; a constant velocity is added, so that the axes do not reverse "
                 f"(excitation {100 * factor:.0f} % of what the limits allow)."
@@ -265,6 +263,16 @@ def freed_of_friction(
     )
     plan = replace(planned.plan, notes=(*planned.plan.notes, note))
     return replace(planned, plan=plan)
+
+
+def _checked(planned: PlannedFast, setting: Setting, noise: Noise) -> PlannedFast | None:
+    """Return the plan with its moves and accuracy; None if it would leave a limit."""
+    try:
+        moves = forecast_multisine(planned.plan, setting)
+    except PlanRefusedError:
+        return None
+    accuracy = expected_accuracy(setting.model, excitations(planned.plan, setting), noise)
+    return replace(planned, moves=moves, accuracy=accuracy)
 
 
 def fine_enough(period: float, model: MachineModel) -> bool:

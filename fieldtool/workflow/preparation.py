@@ -68,4 +68,5 @@ def recording_header(
 def axes_of(group: CanopenGroup, setting: Setting) -> Axes:
     """Return what the runners have to know of the axes."""
     units = tuple(drive.position_unit for drive in group.drives)
-    return Axes(group.axes, setting.limits, setting.centre, units)
+    resolution = np.array([drive.scaling.position for drive in group.drives])
+    return Axes(group.axes, setting.limits, setting.centre, units, resolution)

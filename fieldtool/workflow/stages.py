@@ -10,7 +10,12 @@ from drives.parameters import Change, HeldObject, load_backup
 from drives.profile import MachineProfile, load_machine
 from fieldtool.design.tuning import Tuning, design
 from fieldtool.design.tuning_file import read_tuning, tuning_as_dict
-from fieldtool.errors import FileFormatError, NotEnoughDataError, OutputError
+from fieldtool.errors import (
+    FileFormatError,
+    IdentificationError,
+    NotEnoughDataError,
+    OutputError,
+)
 from fieldtool.frf.response import save_responses
 from fieldtool.identify.recorded import Identified, identify_recording
 from fieldtool.records.model import Estimate, MachineModel
@@ -35,6 +40,10 @@ from fieldtool.workflow.session import (
 )
 from fieldtool.writeback.transaction import WriteBack, apply, changes_for, undo
 
+NOT_KNOWN = 0.3
+"""Relative standard error of a mass or spring from which no controller is designed."""
+DATA_SHEET_APART = 4.0
+"""Tolerances of a motor's inertia that the identified first mass may be apart without a word."""
 Confirm = Callable[[Sequence[Change]], bool]
 
 
@@ -237,10 +246,27 @@ def _identify(session: Session, options: Options) -> Identified:
         prior_model(machine),
         data_sheet_masses(machine, options),
     )
-    for note in identified.notes:
+    for note in (*identified.notes, *_against_data_sheet(session, identified.model)):
         session.warn(note)
     _keep(session.folder, identified, prior_model(machine))
     return identified
+
+
+def _against_data_sheet(session: Session, model: MachineModel) -> list[str]:
+    """Say where an identified motor mass can not be the motor's."""
+    notes = []
+    for axis, found in zip(session.machine.axes, model.axes, strict=True):
+        sheet, first = axis.motor_inertia, found.masses[0]
+        if sheet is None or len(found.masses) == 1:
+            continue
+        allowed = DATA_SHEET_APART * max(sheet.tolerance * sheet.value, first.std)
+        if abs(first.value - sheet.value) > allowed:
+            notes.append(
+                f"{axis.name}: its first mass is {first.value:.4g}, the data sheet of its motor says "
+                f"{sheet.value:.4g} +- {100 * sheet.tolerance:g} %. Another number of masses "
+                "(--masses), or another motor or gear than the profile says?"
+            )
+    return notes
 
 
 def _keep(folder: SessionFolder, identified: Identified, prior: MachineModel | None) -> None:
@@ -258,7 +284,28 @@ def _keep(folder: SessionFolder, identified: Identified, prior: MachineModel | N
     folder.note("identified", notes=list(identified.notes))
 
 
+def check_known(model: MachineModel) -> None:
+    """Refuse a model with a mass or spring that is not known well enough to design from.
+
+    Raises
+    ------
+    IdentificationError
+        Naming it, its value and its error.
+    """
+    for axis in model.axes:
+        for what, values in (("mass", axis.masses), ("spring", axis.springs)):
+            for k, value in enumerate(values):
+                if value.std > NOT_KNOWN * abs(value.value):
+                    raise IdentificationError(
+                        f"{axis.name} {what} {k + 1} is {value.value:.4g} +- {1.96 * value.std:.2g}: "
+                        "that is not known, so no controller is designed. Give the number of masses with "
+                        "`fieldtool identify FOLDER --masses AXIS=N`, or measure longer (--time). The "
+                        "recording is kept."
+                    )
+
+
 def _design(folder: SessionFolder, model: MachineModel) -> Tuning:
+    check_known(model)
     tuning = design(model)
     write_yaml(folder.tuning, tuning_as_dict(tuning))
     return tuning

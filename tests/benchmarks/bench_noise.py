@@ -191,7 +191,7 @@ def _steady(one, setting):
     for each in (*phasors, one.reference):
         spectrum = np.zeros((one.samples // 2 + 1, one.axes), complex)
         spectrum[one.lines] = each * one.samples / 2
-        signals.append(np.tile(np.fft.irfft(spectrum, one.samples, axis=0), (count_of(one, step), 1)))
+        signals.append(np.tile(np.fft.irfft(spectrum, one.samples, axis=0), (one.periods, 1)))
     return _experiment(one, *signals, setting)
 
 

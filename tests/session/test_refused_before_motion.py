@@ -324,7 +324,7 @@ def test_a_sweep_that_would_leave_the_travel_is_refused(bench, monkeypatch):
     assert outcome.code == 3, outcome.err
     assert "sweep table direct, others free: " in outcome.err
     assert "its limit is" in outcome.err
-    assert "Nothing was moved" in outcome.err
+    assert "Nothing of it was moved" in outcome.err
     nothing_was_done(bench)
 
 
