@@ -28,8 +28,9 @@ CHECK_NUDGE = 0.1
 """Share of that move by which each axis is nudged first."""
 CHECK_NUDGE_COUNTS, CHECK_NUDGE_MOST = 20, 0.5
 """A nudge is so many counts of the encoder at least, but never more than this share of the move."""
-CHECK_COUNTS = 3
-"""Counts of the encoder that are added to whatever an axis may go astray."""
+CHECK_COUNTS, CHECK_COUNTS_MOST = 3, 0.25
+"""Counts of the encoder that are added to whatever an axis may go astray, but never more than this
+share of the check's move."""
 CHECK_SLICE = 2
 """Cycles after which the check looks at what the axes did."""
 CHECK_ASTRAY, CHECK_PUSHED = 1e-3, 10.0
@@ -126,10 +127,10 @@ class _DirectionCheck:
         limits = axes.limits[k]
         travel = np.array([one.travel[1] - one.travel[0] for one in axes.limits])
         errors = np.array([one.following_error for one in axes.limits])
-        self._slack = CHECK_COUNTS * axes.counts
+        sizes = CHECK_MOVE * travel
+        self._slack = np.minimum(CHECK_COUNTS * axes.counts, CHECK_COUNTS_MOST * sizes)
         astray = np.maximum(CHECK_ASTRAY * travel, CHECK_ASTRAY_ERROR * errors)
         self._allowed = astray + self._slack
-        sizes = CHECK_MOVE * travel
         most = np.minimum(CHECK_NUDGE_COUNTS * axes.counts, CHECK_NUDGE_MOST * sizes)
         nudges = np.maximum(CHECK_NUDGE * sizes, most)
         self._reach = nudges if nudge else np.maximum(nudges, CHECK_PUSHED * astray)
@@ -202,9 +203,9 @@ class _DirectionCheck:
         """Raise if it left where it stood; back to its first start, where its target is, it may go."""
         if not min(0.0, offset) - allowed <= moved <= max(0.0, offset) + allowed:
             raise SafetyStopError(
-                f"{name}: moved by {moved - offset:.3g} {unit} while it was told to stand still; its power was "
-                "cut and all axes were stopped. Either the axis moves the wrong way (check the "
-                "encoder's direction and the motor's phases), or its loop is not stable, or it sags "
+                f"{name}: moved by {moved - offset:.3g} {unit} while it was told to stand still; its "
+                "power was cut and all axes were stopped. Either the axis moves the wrong way (check "
+                "the encoder's direction and the motor's phases), or its loop is not stable, or it sags "
                 "when its brake opens.",
                 axis=name,
                 runaway=True,
@@ -220,8 +221,8 @@ class _DirectionCheck:
         if forward < min(0.0, ahead) - astray or forward > max(0.0, ahead) + 1.5 * size + slack:
             raise SafetyStopError(
                 f"{name}: moves the wrong way or by itself: {self._wanted:.3g} {unit} was commanded, it "
-                f"moved {moved - offset:.3g} {unit}; its power was cut and all axes were stopped. Check the "
-                "encoder's direction and the motor's phases.",
+                f"moved {moved - offset:.3g} {unit}; its power was cut and all axes were stopped. "
+                "Check the encoder's direction and the motor's phases.",
                 axis=name,
                 runaway=True,
             )
@@ -229,8 +230,8 @@ class _DirectionCheck:
         if half_way and not self._nudge and forward - ahead < CHECK_STARTED * size:
             raise SafetyStopError(
                 f"{name}: does not follow: half of {self._wanted:.3g} {unit} was commanded, it moved "
-                f"{moved - offset:.3g} {unit}; its power was cut and all axes were stopped. Is it blocked or "
-                "its brake closed, or does the encoder not count?",
+                f"{moved - offset:.3g} {unit}; its power was cut and all axes were stopped. "
+                "Is it blocked or its brake closed, or does the encoder not count?",
                 axis=name,
                 runaway=True,
             )

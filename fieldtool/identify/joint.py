@@ -270,7 +270,7 @@ def _runner_up(order: OrderSelection, names: Sequence[str]) -> str:
         return ""
     chosen = ", ".join(f"{name} {order.masses[name]}" for name in names)
     other = ", ".join(f"{name} {n}" for name, n in zip(names, second.masses, strict=True))
-    return f"Number of masses, chosen on evidence: {chosen}. Runner-up: {other}; {second.why}"
+    return f"Number of masses, chosen on evidence: {chosen}. Runner-up: {other}; {second.why}."
 
 
 def _structure_notes(reduced: BlockReduced | None) -> list[str]:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from fieldtool.errors import NotEnoughDataError
 from fieldtool.frf.phasors import Phasors
+from fieldtool.identify.whitening import whitening
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -75,11 +76,7 @@ class JointSpectra:
         if floor:
             size = np.linalg.norm(self.position, axis=1)
             covariance = covariance + (floor * size[:, None, None]) ** 2 * np.eye(len(self.names))
-        std = np.sqrt(np.einsum("rkk->rk", covariance).real)
-        lower = np.linalg.cholesky(covariance / (std[:, :, None] * std[:, None, :]))
-        whiten: ComplexArray = np.linalg.inv(lower).astype(np.complex128)
-        scaled: ComplexArray = np.sqrt(2.0) * whiten / std[:, None, :]
-        return scaled
+        return whitening(covariance)
 
 
 def frequencies_of(phasors: Sequence[Phasors]) -> FloatArray:

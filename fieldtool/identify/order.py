@@ -143,8 +143,9 @@ def select_order(
     choices = _choices(data.names, given, longest)
     most = sum(c[-1] - 1 for c in choices)
     search = find_modes(data, most, prior=prior)
-    trials = _simple_trials(data, kinds or {}, choices, search, prior)
-    trials += _trials(data, kinds or {}, choices, search, trials)
+    simple = _simple_trials(data, kinds or {}, choices, search, prior)
+    trials = _trials(data, kinds or {}, choices, search, simple)
+    trials += [_at_errors_of_the_method(t) for t in simple]
     if not any(t.accepted for t in trials):
         raise _nothing_fits(data.names, search, trials, most)
     best, decided = _best(trials, prior)
@@ -171,9 +172,8 @@ def _best(trials: "Sequence[_Trial]", prior: MachineModel | None) -> "tuple[_Tri
         if len(kept) < len(near):
             near, decided = kept, "the motor masses of the prior model decided"
     if len(near) > 1:
-        also = " first" if decided.startswith("the motor") else ""
         even = "the most even masses and springs were taken"
-        decided = f"{decided}{also}, then {even}" if also else even
+        decided = f"{decided}, then {even}" if decided.startswith("the motor") else even
     return min(near, key=lambda t: t.unevenness), decided
 
 
@@ -220,7 +220,7 @@ class _Trial:
     @property
     def excess(self) -> float:
         """Chi2 over its degrees of freedom; NaN if not refined."""
-        return self.refined.chi2 / self.refined.degrees_of_freedom if self.refined else nan
+        return self.refined.chi2 / max(self.refined.degrees_of_freedom, 1) if self.refined else nan
 
     def motors_off(self, prior: MachineModel) -> float:
         """Largest relative difference of a motor mass from the prior's."""
@@ -267,6 +267,14 @@ def _simple_trials(
         for start in starts
         if all(n in given for n, given in zip(_lengths(start), choices, strict=True))
     ]
+
+
+def _at_errors_of_the_method(trial: _Trial) -> _Trial:
+    """Accept a simple machine whose misfit is small, though free modes follow what it leaves."""
+    if trial.refined is None or not trial.excess < FAR or _not_known(trial.refined.model):
+        return trial
+    why = f"misfit {sqrt(trial.excess):.3g} times the noise, more than that of free modes"
+    return trial if trial.accepted else replace(trial, accepted=True, why=why)
 
 
 def _from_machine(
@@ -394,12 +402,12 @@ def _refined(
         return replace(trial, why=f"can not be refined: {error}")
     price = len(found.names) * log(max(data.count, 2))
     limit = min(_acceptable(modal, found), UNEXPLAINED * found.degrees_of_freedom)
-    excess = found.chi2 / found.degrees_of_freedom
-    why = f"misfit {excess:.3g} times the noise, free modes {modal.excess:.3g}"
+    excess = found.chi2 / max(found.degrees_of_freedom, 1)
+    why = f"misfit {sqrt(excess):.3g} times the noise, free modes {sqrt(modal.excess):.3g}"
     unknown = _not_known(found.model)
     explains = found.chi2 <= limit
     if not explains:
-        why += ": chains of these lengths do not explain the responses"
+        why = f"it does not explain the responses ({why})"
     elif unknown:
         why += f", but the responses do not tell {', '.join(unknown)}"
     accepted = explains and not unknown
@@ -531,7 +539,7 @@ def _other_doubts(
         )
     if best.excess > FAR:
         doubts.append(
-            f"the misfit is {best.excess:.3g} times the noise: something is not linear or changes "
+            f"the misfit is {sqrt(best.excess):.3g} times the noise: something is not linear or changes "
             "with time, or the noise is larger than stated; standard errors are enlarged by it"
         )
     return doubts
@@ -547,7 +555,7 @@ def _nothing_fits(
     modes = search.modal.omega.size
     where = ", ".join(f"{w / (2 * pi):.4g}" for w in search.modal.omega)
     found = f"the responses hold {modes} modes" + (f" (at {where} Hz)" if modes else "")
-    if not trials:
+    if not trials or modes > most:
         return IdentificationError(
             f"{found}, more than the {most} that the given numbers of masses allow; allow longer "
             "chains or more masses"

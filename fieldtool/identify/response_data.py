@@ -7,11 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fieldtool.errors import NotEnoughDataError
+from fieldtool.identify.whitening import whitening
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
-LOAD = 1e-12
-"""Added to the diagonal of correlations, so that elements that are one and the same do no harm."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,16 +133,11 @@ class ResponseMatrix:
             raise ValueError("errors are independent: there is nothing to whiten")
         covariance = self.covariance[self._lines]
         size = covariance.shape[1]
-        std = np.sqrt(np.einsum("fkk->fk", covariance).real)
         if floor:
-            added = self.errors(floor)[self._lines].reshape(-1, size) ** 2 - std**2
+            variance = np.einsum("fkk->fk", covariance).real
+            added = self.errors(floor)[self._lines].reshape(-1, size) ** 2 - variance
             covariance = covariance + np.eye(size) * added[:, :, None]
-            std = np.sqrt(np.einsum("fkk->fk", covariance).real)
-        scaled = covariance / (std[:, :, None] * std[:, None, :])
-        lower = np.linalg.cholesky(scaled + LOAD * np.eye(size))
-        inverse = np.linalg.inv(lower).astype(np.complex128)
-        result: ComplexArray = np.sqrt(2.0) * inverse / std[:, None, :]
-        return result
+        return whitening(covariance)
 
     def _check_covariance(self, covariance: ComplexArray) -> None:
         size, axes = self.omega.size, len(self.names)

@@ -11,7 +11,7 @@ from fieldtool.identify.mode_search import find_modes
 from fieldtool.identify.order import select_order
 from fieldtool.identify.refine import machine_response
 from fieldtool.identify.response_data import ResponseMatrix
-from fieldtool.records.model import Estimate
+from fieldtool.records.model import AxisModel, Coupling, Estimate, MachineModel
 
 
 def frequencies(model):
@@ -131,3 +131,89 @@ def test_every_pair_must_be_measured(random_model, fresh_rng):
     response[:, 0, 1] = response[:, 1, 0] = np.nan
     with pytest.raises(NotEnoughDataError, match="axis1 and axis2"):
         select_order(ResponseMatrix(data.names, data.omega, response, std))
+
+
+def chain(name, masses, springs=(), dampers=(), friction=0.02):
+    values = [tuple(Estimate(float(v)) for v in each) for each in (masses, springs, dampers)]
+    return AxisModel(name, "rotary", *values, Estimate(friction))
+
+
+def turntable(table, arm):
+    return MachineModel((table, arm), (Coupling(("table", "arm"), 0.009),))
+
+
+def seen_with(model, rng, omega, wrong=0.0, noise=1e-3):
+    """Measured with noise; `wrong` is the share of a smooth error that no machine explains."""
+    exact = machine_response(model, omega)
+    data = with_noise(model.names, omega, exact, noise, rng)
+    ripple = np.sin(9.0 * omega / omega.max() + rng.uniform(0.0, 6.0))[:, None, None]
+    return replace(data, response=data.response + wrong * noise * ripple * exact)
+
+
+def weights(order):
+    return [m.value for axis in order.model.axes for m in axis.masses]
+
+
+def test_motor_masses_of_the_prior_decide_where_the_responses_do_not(fresh_rng):
+    table = chain("table", (0.02, 0.02, 0.03), (190, 600), (0.03, 0.03))
+    truth = turntable(table, chain("arm", (0.04, 0.03), (250,), (0.03,)))
+    prior = turntable(
+        chain("table", (0.02, 0.025), (190,), (0.02,)), chain("arm", (0.04,), friction=0.01)
+    )
+    data = seen_with(truth, fresh_rng, 2 * np.pi * np.linspace(3.0, 50.0, 120), wrong=0.5)
+    found = select_order(data, prior=prior)
+    assert [axis.masses[0].value for axis in found.model.axes] == pytest.approx(
+        [0.02, 0.04], rel=0.1
+    )
+    assert any("motor masses of the prior model decided" in doubt for doubt in found.doubts)
+    found = select_order(data, prior=truth)
+    assert tuple(found.masses.values()) == (3, 2)
+    assert any("the prior model's lengths were taken" in doubt for doubt in found.doubts)
+    assert weights(found) == pytest.approx([0.02, 0.02, 0.03, 0.04, 0.03], rel=0.1)
+    found = select_order(data)
+    assert any("most even masses and springs were taken" in doubt for doubt in found.doubts)
+
+
+def test_a_joint_with_strong_damping_is_found_with_its_prior(fresh_rng):
+    truth = turntable(chain("table", (0.02, 0.03), (190,), (1.0,)), chain("arm", (0.04,)))
+    prior = turntable(
+        chain("table", (0.02, 0.025), (190,), (0.02,), 0.01), chain("arm", (0.04,), friction=0.01)
+    )
+    prior = replace(prior, couplings=())
+    data = seen_with(truth, fresh_rng, 2 * np.pi * np.linspace(2.0, 40.0, 120), wrong=1.0)
+    found = select_order(data, prior=prior)
+    assert tuple(found.masses.values()) == (2, 1)
+    assert weights(found) == pytest.approx([0.02, 0.03, 0.04], rel=0.1)
+    assert found.model.axes[0].springs[0].value == pytest.approx(190.0, rel=0.1)
+    assert found.model.couplings[0].value == pytest.approx(0.009, rel=0.1)
+
+
+def test_what_is_accepted_has_masses_and_springs_that_are_known(fresh_rng):
+    table = chain("table", (0.02, 0.03), (190,), (1.0,))
+    data = seen_with(
+        turntable(table, chain("arm", (0.04,))), fresh_rng, 2 * np.pi * np.linspace(2.0, 40.0, 120)
+    )
+    long = turntable(chain("table", (0.02, 0.01, 0.02), (190, 1e5)), chain("arm", (0.04,)))
+    try:
+        found = select_order(data, prior=long)
+    except IdentificationError:
+        return
+    for axis in found.model.axes:
+        for each in (*axis.masses, *axis.springs):
+            assert each.std < 0.5 * each.value
+
+
+@pytest.mark.parametrize("with_prior", [True, False])
+@pytest.mark.parametrize("wrong", [0.0, 1.0])
+def test_rigid_axes_are_rigid(with_prior, wrong, fresh_rng):
+    axes = [chain(n, (m,)) for n, m in (("table", 0.05), ("arm", 0.04), ("wrist", 0.04))]
+    couplings = (Coupling(("table", "arm"), 0.009), Coupling(("arm", "wrist"), 0.006))
+    truth = MachineModel(tuple(axes), couplings)
+    data = seen_with(truth, fresh_rng, 2 * np.pi * np.linspace(1.0, 40.0, 120), wrong)
+    found = select_order(data, prior=truth if with_prior else None)
+    assert tuple(found.masses.values()) == (1, 1, 1)
+    assert not [doubt for doubt in found.doubts if "is in doubt" in doubt]
+    assert weights(found) == pytest.approx([0.05, 0.04, 0.04], rel=0.01)
+    values = {c.axes: c.value for c in found.model.couplings}
+    assert values["table", "arm"] == pytest.approx(0.009, rel=0.02)
+    assert values["table", "wrist"] == pytest.approx(0.0, abs=2e-4)
