@@ -6,7 +6,7 @@ error holds whatever the controllers did; what it leaves is compared with the no
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from math import sqrt
 
@@ -49,6 +49,8 @@ WORTH = 25.0
 """By so much chi2 has to fall for each axis' friction at its last mass to be believed."""
 BENT = 0.01
 """Distortion over torque from which it is said with an error: chains without friction show none."""
+GOOD = 3.0
+"""Misfit over noise at which no further start is tried."""
 MOST_UNEXPLAINED = 0.3
 """Share of the motion that may be left unexplained."""
 UNEXPLAINED = 1.5
@@ -122,7 +124,7 @@ def identify_joint(
                 modal, start = _known_order(data, {**last, **masses}, kinds, prior, notes)
         priors = {f"{name}.mass[1]": mass for name, mass in (motor_masses or {}).items()}
         fit = _Fit(phasors, recording, priors)
-        first = refine(_still_loads(start), data, fit_delay=True, fit_friction=True, priors=priors)
+        first = _first_fit(_starts(start, modal, prior, kinds), data, priors)
         fitted, friction = fit.run(first)
     _check_explained(fit.unexplained(fitted), friction)
     notes += [unknown.reason for unknown in fitted.unknown]
@@ -271,6 +273,44 @@ def _runner_up(order: OrderSelection, names: Sequence[str]) -> str:
     chosen = ", ".join(f"{name} {order.masses[name]}" for name in names)
     other = ", ".join(f"{name} {n}" for name, n in zip(names, second.masses, strict=True))
     return f"Number of masses, chosen on evidence: {chosen}. Runner-up: {other}; {second.why}."
+
+
+def _starts(
+    start: MachineModel,
+    modal: ModalModel,
+    prior: MachineModel | None,
+    kinds: Mapping[str, Kind],
+) -> Iterator[MachineModel]:
+    """Where to begin, best guess first: blocks, one axis at a time, the machine as last accepted."""
+    yield start
+    lengths = {axis.name: len(axis.masses) for axis in start.axes}
+    with suppress(IdentificationError, ValueError):
+        yield reduce_modes(modal, lengths, kinds).model
+    if prior is not None and {a.name: len(a.masses) for a in prior.axes} == lengths:
+        yield prior
+
+
+def _first_fit(
+    starts: Iterator[MachineModel], data: ResponseMatrix, priors: Mapping[str, Estimate]
+) -> RefinedModel:
+    """Fit from one start after another until the responses are explained; the best otherwise."""
+    best: RefinedModel | None = None
+    failure: IdentificationError | None = None
+    for start in starts:
+        try:
+            found = refine(
+                _still_loads(start), data, fit_delay=True, fit_friction=True, priors=priors
+            )
+        except IdentificationError as error:
+            failure = failure or error
+            continue
+        if best is None or found.chi2 < best.chi2:
+            best = found
+        if best.chi2 <= GOOD * best.degrees_of_freedom:
+            break
+    if best is None:
+        raise failure or IdentificationError("there is no machine to begin the fit from")
+    return best
 
 
 def _structure_notes(reduced: BlockReduced | None) -> list[str]:

@@ -10,6 +10,8 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 FloatArray = NDArray[np.float64]
 Function = Callable[[FloatArray, float], FloatArray]
+FIRST_DAMPING = 1e-2
+"""Relative to the columns' sizes: a bolder first step ends far away from a poor start."""
 GENTLE_START = (0.3, 0.03, 0.0)
 """Relative errors added to the noise while the fit is still far off, one stage after another."""
 
@@ -111,7 +113,7 @@ def _descend(
 ) -> tuple[FloatArray, float]:
     """Return the parameters and their sum of squares."""
     r = residuals(x, floor)
-    cost, damping, growth = float(r @ r), 1e-6, 4.0
+    cost, damping, growth = float(r @ r), FIRST_DAMPING, 4.0
     size = np.zeros(x.size)
     normal, gradient = np.zeros((x.size, x.size)), np.zeros(x.size)
     moved = True

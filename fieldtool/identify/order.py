@@ -40,7 +40,6 @@ from fieldtool.identify.mode_search import (
     with_strongest_hint,
     without_mode,
 )
-from fieldtool.identify.mode_search import criterion as modal_criterion
 from fieldtool.identify.modes import prior_poles
 from fieldtool.identify.refine import UNKNOWN_ABOVE, RefinedModel, refine
 from fieldtool.identify.response_data import ResponseMatrix
@@ -148,7 +147,8 @@ def select_order(
     trials += [_at_errors_of_the_method(t) for t in simple]
     if not any(t.accepted for t in trials):
         raise _nothing_fits(data.names, search, trials, most)
-    best, decided = _best(trials, prior)
+    comparable = prior if prior is not None and prior.names == data.names else None
+    best, decided = _best(trials, comparable)
     return _selection(data, search, trials, best, decided)
 
 
@@ -491,8 +491,8 @@ def _candidate(trial: _Trial, best: _Trial) -> Candidate:
 
 def _mode_doubts(search: ModeSearch, best: _Trial) -> list[str]:
     """Modes that hardly rise out of the noise, are left out, or may be missing."""
-    if max(best.lengths) == 1 and _at_the_noise(search, best):
-        return []
+    if max(best.lengths) == 1 and best.excess < FAR:
+        return []  # what is left is noise and errors of the method, which free modes follow
     doubts = []
     larger = max((search.modal, best.modal), key=lambda modal: modal.omega.size)
     for w, seen in zip(larger.omega, standing_out(larger), strict=True):
@@ -515,12 +515,6 @@ def _mode_doubts(search: ModeSearch, best: _Trial) -> list[str]:
             "more strongly there, or look for what is not linear"
         )
     return doubts
-
-
-def _at_the_noise(search: ModeSearch, best: _Trial) -> bool:
-    """Whether a machine explains the responses so well that modes beyond it are not worth a word."""
-    unit = max(search.modal.excess, 1.0)
-    return best.excess < FAR and best.criterion < modal_criterion(search.modal) + DECISIVE * unit
 
 
 def _other_doubts(
