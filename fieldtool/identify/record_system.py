@@ -1,6 +1,6 @@
 """Residuals of spectra of whole records at one set of parameters, and their derivatives.
 
-See :mod:`fieldtool.identify.spectra` for the equation.  The states of each experiment are eliminated:
+See ``spectra`` for the equation.  The states of each experiment are eliminated:
 residuals and derivatives are what they can not explain.
 """
 

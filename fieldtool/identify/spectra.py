@@ -84,7 +84,7 @@ def refine_spectra(
     spectra : Spectra, or several
         Records of one length each, same axes in the same order.
     fixed, priors, fit_delay, fit_friction, fit_load_friction, delays
-        As for :func:`fieldtool.identify.refine.refine`; the names of torque parts count as well.
+        As for ``refine``; the names of torque parts count as well.
     robust : bool
         Take the standard errors from what the misfit does to the parameters in one stretch of time
         after the other, instead of the given variances alone; never smaller than these.  Honest

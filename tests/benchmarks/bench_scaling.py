@@ -1,7 +1,7 @@
 """Time from a response matrix to the refined model with covariance, against axes and masses.
 
 Random machines, all numbers of masses known: modes, block order reduction, maximum likelihood fit, as
-:mod:`fieldtool.identify.joint` does it.  The responses have odd lines over the band of the modes and
+fieldtool.identify does it.  The responses have odd lines over the band of the modes and
 errors e = G dT with their covariance, 3e-4 N m of noise on torques of 1 N m.
 
 Targets of the project: 3 axes of 3 masses in under 1 s, 6 axes of 4 masses (24 masses, 18 springs, 15
