@@ -32,7 +32,7 @@ from fieldtool.workflow.planning import (
 )
 from fieldtool.workflow.preparation import axes_of, recording_header, setting_of
 from fieldtool.workflow.session import Options, Screen, Session
-from fieldtool.workflow.stopped import judge_stop
+from fieldtool.workflow.stopped import check_loops, judge_stop
 from fieldtool.writeback.transaction import take_backup
 
 GUESSED_NOISE = 1e-3
@@ -210,6 +210,7 @@ class _Measurement:
         modes = ", ".join(f"{w / (2 * np.pi):.2f}" for w in undamped_modes(found.model)[0])
         session.screen.say(f"Resonances found: {modes} Hz." if modes else "The axes are rigid.")
         now_known = replace(self._setting, model=found.model)
+        check_loops(now_known)
         main = plan_main(
             now_known,
             pilot.cycle_time,

@@ -1,4 +1,4 @@
-"""Whether a loop was unstable, when a limit stopped the axes while the fast plan ran.
+"""Whether a loop was unstable: when a limit stopped the axes, or by what the pilot has shown.
 
 The experiments' own watch judges each block, from the excitation's beginning on, and is careful: nobody
 wants to lose a measurement to a false alarm.  After a stop nothing is to be lost any more, and the whole
@@ -15,6 +15,7 @@ from drives.api import Capture
 from drives.errors import SafetyStopError, StoppedError
 from fieldtool.errors import LoopUnstableError
 from fieldtool.experiment.axes import Axes, Keep, keep_whatever_happens, sample_times
+from fieldtool.experiment.forecast import Setting
 from fieldtool.experiment.growth import GrowthWatch
 from fieldtool.records.model import FloatArray
 from fieldtool.records.recording import Experiment
@@ -76,6 +77,34 @@ def judge_stop(
     if unstable is not None:
         unstable.add_note(f"what stopped the axes: {error}")
         raise unstable from error
+
+
+def check_loops(setting: Setting) -> None:
+    """Refuse to go on with loops that are unstable with the model that the pilot has shown.
+
+    The pilot may be too short and too weak for an oscillation to grow up to a limit.
+
+    Raises
+    ------
+    LoopUnstableError
+        Naming the axis whose motor takes most part in what grows.
+    """
+    loop = setting.closed_loop(())
+    if loop.stable:
+        return
+    values, vectors = np.linalg.eig(loop.system_matrix())
+    worst = int(np.argmax(values.real))
+    rate, omega = float(values[worst].real), abs(float(values[worst].imag))
+    name = setting.model.names[int(np.argmax(np.abs(vectors[setting.model.first_masses, worst])))]
+    grows = f"an oscillation at {omega / (2 * np.pi):.3g} Hz" if omega else "a motion"
+    raise LoopUnstableError(
+        f"{name}: its loop is unstable: by what the pilot has shown of the masses and springs, {grows} "
+        f"grows by a factor of e in {1 / max(rate, 1e-9):.2g} s. All axes are disabled, and the raw "
+        "data are kept. Lower the drive's gains (velocity_i, then position_p and velocity_p) and "
+        "measure again.",
+        axis=name,
+        frequency=omega / (2 * np.pi),
+    )
 
 
 def _way(capture: Capture, following: str, step: float, note: str) -> Experiment:
