@@ -15,10 +15,10 @@ from rich.text import Text
 
 from fieldtool.design.tuning import Tuning
 from fieldtool.experiment.forecast import AxisForecast
-from fieldtool.experiment.multisine_runner import MultisineProgress
-from fieldtool.experiment.plan import SweepPlan
-from fieldtool.experiment.runner import Progress
-from fieldtool.identify.expected import Expected
+from fieldtool.experiment.multisine.runner import MultisineProgress
+from fieldtool.experiment.stepped.plan import SweepPlan
+from fieldtool.experiment.stepped.runner import Progress
+from fieldtool.identify.likelihood.expected import Expected
 from fieldtool.records.model import Estimate, Kind, MachineModel
 from fieldtool.workflow import SessionResult, parameter_table
 from fieldtool.workflow.planning import PlannedFast

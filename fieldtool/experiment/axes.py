@@ -9,7 +9,7 @@ import numpy as np
 
 from drives.api import AxisLimits, Capture, FloatArray, Motion
 from fieldtool.errors import FieldtoolError
-from fieldtool.experiment.plan import smooth_move
+from fieldtool.experiment.stepped.plan import smooth_move
 from fieldtool.records.recording import Experiment
 
 MOVE_SHARE = 0.25

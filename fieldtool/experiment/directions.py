@@ -15,7 +15,7 @@ from fieldtool.experiment.axes import (
     keep_whatever_happens,
     sample_times,
 )
-from fieldtool.experiment.plan import smooth_move
+from fieldtool.experiment.stepped.plan import smooth_move
 from fieldtool.records.recording import Experiment
 
 CHECK_REST = 0.3

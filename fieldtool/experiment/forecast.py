@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from drives.api import AxisLimits
 from fieldtool.errors import PlanRefusedError
-from fieldtool.experiment.plan import Sweep, SweepPlan, tone_blocks, transition
+from fieldtool.experiment.stepped.plan import Sweep, SweepPlan, tone_blocks, transition
 from fieldtool.records.closed_loop import AxisLoop, ClosedLoop
 from fieldtool.records.model import FloatArray, Kind, MachineModel
 

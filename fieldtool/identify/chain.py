@@ -12,13 +12,13 @@ import numpy as np
 
 from fieldtool.errors import NotEnoughDataError
 from fieldtool.frf.matrix import column_responses
-from fieldtool.frf.multisine import analyse_multisine
+from fieldtool.frf.multisine.single_axis import analyse_multisine
 from fieldtool.frf.response import FrequencyResponse
+from fieldtool.identify.chains.modal_chain import reduce_modes
 from fieldtool.identify.features import ChainFeatures, chain_features
-from fieldtool.identify.modal_chain import reduce_modes
-from fieldtool.identify.modes import fit_modes
-from fieldtool.identify.refine import RefinedModel, refine
-from fieldtool.identify.response_data import ResponseMatrix
+from fieldtool.identify.likelihood.refine import RefinedModel, refine
+from fieldtool.identify.likelihood.response_data import ResponseMatrix
+from fieldtool.identify.modes.fit import fit_modes
 from fieldtool.records.model import Estimate, MachineModel
 from fieldtool.records.recording import Recording
 

@@ -30,13 +30,13 @@ from fieldtool.frf.low_frequency import (
 )
 from fieldtool.frf.matrix import OTHERS_FREE, solved_response
 from fieldtool.frf.response import FrequencyResponse
-from fieldtool.frf.stepped import SteppedResult
-from fieldtool.identify.modal_chain import reduction_inputs
-from fieldtool.identify.modal_model import ModalModel
-from fieldtool.identify.modes import fit_modes
-from fieldtool.identify.order_reduction import CrossGain, ReducedMachine, reduce_machine
-from fieldtool.identify.refine import refine
-from fieldtool.identify.response_data import ResponseMatrix
+from fieldtool.frf.stepped.responses import SteppedResult
+from fieldtool.identify.chains.modal_chain import reduction_inputs
+from fieldtool.identify.chains.order_reduction import CrossGain, ReducedMachine, reduce_machine
+from fieldtool.identify.likelihood.refine import refine
+from fieldtool.identify.likelihood.response_data import ResponseMatrix
+from fieldtool.identify.modes.fit import fit_modes
+from fieldtool.identify.modes.model import ModalModel
 from fieldtool.records.model import Estimate, FloatArray, Kind, MachineModel
 
 RELATIVE_FLOOR = 5e-4

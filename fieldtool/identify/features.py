@@ -10,9 +10,13 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import eig, eigh
 
-from fieldtool.identify.least_squares import propagate, standard_errors
-from fieldtool.identify.parameters import machine_parameters, parameter_values, with_values
-from fieldtool.identify.refine import RefinedModel
+from fieldtool.identify.likelihood.least_squares import propagate, standard_errors
+from fieldtool.identify.likelihood.parameters import (
+    machine_parameters,
+    parameter_values,
+    with_values,
+)
+from fieldtool.identify.likelihood.refine import RefinedModel
 from fieldtool.records.model import Estimate, FloatArray, MachineModel
 
 STEP = 1e-5

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fieldtool.errors import NotEnoughDataError
-from fieldtool.frf.multisine import analyse_multisine
-from fieldtool.frf.periods import average_periods
+from fieldtool.frf.multisine.periods import average_periods
+from fieldtool.frf.multisine.single_axis import analyse_multisine
 from fieldtool.records.model import MachineModel
 from fieldtool.records.recorded import Experiment, Recording
 

@@ -7,12 +7,12 @@ import numpy as np
 
 from fieldtool.errors import NotEnoughDataError
 from fieldtool.frf.response import FrequencyResponse
-from fieldtool.frf.stepped import stepped_responses
+from fieldtool.frf.stepped.responses import stepped_responses
 from fieldtool.identify.chain import ChainResult, identify_chain
 from fieldtool.identify.classic import identify_classic
-from fieldtool.identify.joint import identify_joint
-from fieldtool.identify.moves import identify_moves
-from fieldtool.identify.refine import RefinedModel
+from fieldtool.identify.likelihood.refine import RefinedModel
+from fieldtool.identify.moves.identify import identify_moves
+from fieldtool.identify.multisine.identify import identify_joint
 from fieldtool.records.model import Estimate, FloatArray, Kind, MachineModel
 from fieldtool.records.recording import Recording
 

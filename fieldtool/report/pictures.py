@@ -12,8 +12,8 @@ from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 from fieldtool.errors import OutputError
 from fieldtool.frf.matrix import OTHERS_FREE, SOLVED
 from fieldtool.frf.response import FrequencyResponse
-from fieldtool.identify.model_band import relative_std
-from fieldtool.identify.refine import RefinedModel, machine_response
+from fieldtool.identify.likelihood.model_band import relative_std
+from fieldtool.identify.likelihood.refine import RefinedModel, machine_response
 from fieldtool.records.model import FloatArray, MachineModel
 
 MEASURED, MODEL, PRIOR = "#1f3b73", "#d1495b", "#9aa5b1"

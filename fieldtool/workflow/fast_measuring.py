@@ -10,15 +10,15 @@ from drives.canopen_drive import CanopenGroup, connect
 from drives.errors import StoppedError, UserStopError
 from drives.profile import MachineProfile, load_machine
 from fieldtool.experiment.axes import Axes
-from fieldtool.experiment.classic import undamped_modes
 from fieldtool.experiment.directions import check_directions
-from fieldtool.experiment.fast import fast_cycle_times
 from fieldtool.experiment.forecast import Setting
-from fieldtool.experiment.multisine import MultisinePlan
-from fieldtool.experiment.multisine_forecast import experiment_peaks
-from fieldtool.experiment.multisine_runner import run_multisine
-from fieldtool.identify.expected import Noise
-from fieldtool.identify.pilot import read_pilot
+from fieldtool.experiment.multisine.design import fast_cycle_times
+from fieldtool.experiment.multisine.forecast import experiment_peaks
+from fieldtool.experiment.multisine.plan import MultisinePlan
+from fieldtool.experiment.multisine.runner import run_multisine
+from fieldtool.experiment.stepped.design import undamped_modes
+from fieldtool.identify.likelihood.expected import Noise
+from fieldtool.identify.multisine.pilot import read_pilot
 from fieldtool.records.recording import Experiment, Recording, RecordingWriter
 from fieldtool.workflow.models import prior_model
 from fieldtool.workflow.planning import (

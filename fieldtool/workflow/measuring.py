@@ -7,16 +7,16 @@ import numpy as np
 from drives.canopen_drive import CanopenGroup
 from drives.errors import UserStopError
 from fieldtool.errors import IdentificationError
-from fieldtool.experiment.classic import (
+from fieldtool.experiment.directions import check_directions
+from fieldtool.experiment.forecast import forecast
+from fieldtool.experiment.stepped.design import (
     chosen_cycle_time,
     classic_plan,
     lowest_mode,
     refined_plan,
     undamped_modes,
 )
-from fieldtool.experiment.directions import check_directions
-from fieldtool.experiment.forecast import forecast
-from fieldtool.experiment.runner import run_plan
+from fieldtool.experiment.stepped.runner import run_plan
 from fieldtool.identify.classic import without_friction
 from fieldtool.identify.recorded import identify_recording
 from fieldtool.records.recording import Experiment, Recording, RecordingWriter

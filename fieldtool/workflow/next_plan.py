@@ -10,10 +10,10 @@ from drives.api import AxisLimits
 from drives.profile import load_machine
 from fieldtool.design.tuning import design
 from fieldtool.errors import IdentificationError
-from fieldtool.experiment.fast import fast_cycle_times, longest_cycle
 from fieldtool.experiment.forecast import Setting
-from fieldtool.identify.expected import Noise
-from fieldtool.identify.pilot import measured_noise
+from fieldtool.experiment.multisine.design import fast_cycle_times, longest_cycle
+from fieldtool.identify.likelihood.expected import Noise
+from fieldtool.identify.multisine.pilot import measured_noise
 from fieldtool.identify.recorded import Identified
 from fieldtool.records.closed_loop import AxisLoop, loop_from_parameters
 from fieldtool.records.model import FloatArray

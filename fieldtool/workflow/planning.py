@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from fieldtool.errors import PlanRefusedError
-from fieldtool.experiment.fast import (
+from fieldtool.experiment.forecast import AxisForecast, Setting
+from fieldtool.experiment.multisine.design import (
     MORE_PERIODS,
     PERIODS,
     PILOT_SHARE,
@@ -20,12 +21,11 @@ from fieldtool.experiment.fast import (
     shortest_period,
     with_bias,
 )
-from fieldtool.experiment.forecast import AxisForecast, Setting
-from fieldtool.experiment.multisine import MultisinePlan
-from fieldtool.experiment.multisine_forecast import forecast_multisine, predicted_phasors
-from fieldtool.identify.expected import Excitation, Expected, Noise, expected_accuracy
-from fieldtool.identify.friction_left import DryFriction
-from fieldtool.identify.pilot import FRICTION_SEEN
+from fieldtool.experiment.multisine.forecast import forecast_multisine, predicted_phasors
+from fieldtool.experiment.multisine.plan import MultisinePlan
+from fieldtool.identify.likelihood.expected import Excitation, Expected, Noise, expected_accuracy
+from fieldtool.identify.multisine.dry_friction import DryFriction
+from fieldtool.identify.multisine.pilot import FRICTION_SEEN
 from fieldtool.records.model import MachineModel
 
 SECONDS, SHORTEST_SECONDS, SWINGS = 60.0, 12.0, 125.0

@@ -16,9 +16,9 @@ from drives.profile import MachineProfile, load_machine
 from fieldtool.design.tuning import Tuning
 from fieldtool.errors import OutputError
 from fieldtool.experiment.forecast import AxisForecast
-from fieldtool.experiment.multisine_runner import MultisineProgress
-from fieldtool.experiment.plan import SweepPlan
-from fieldtool.experiment.runner import Progress
+from fieldtool.experiment.multisine.runner import MultisineProgress
+from fieldtool.experiment.stepped.plan import SweepPlan
+from fieldtool.experiment.stepped.runner import Progress
 from fieldtool.identify.recorded import Identified
 from fieldtool.records.model import MachineModel
 from fieldtool.records.session_folder import SessionFolder

@@ -299,8 +299,8 @@ def check_known(model: MachineModel) -> None:
                     raise IdentificationError(
                         f"{axis.name} {what} {k + 1} is {value.value:.4g} +- {1.96 * value.std:.2g}: "
                         "that is not known, so no controller is designed. Give the number of masses "
-                        "with `fieldtool identify FOLDER --masses AXIS=N`, or measure longer (--time). The "
-                        "recording is kept."
+                        "with `fieldtool identify FOLDER --masses AXIS=N`, or measure longer (--time). "
+                        "The recording is kept."
                     )
 
 

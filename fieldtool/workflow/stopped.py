@@ -16,7 +16,7 @@ from drives.errors import SafetyStopError, StoppedError
 from fieldtool.errors import LoopUnstableError
 from fieldtool.experiment.axes import Axes, Keep, keep_whatever_happens, sample_times
 from fieldtool.experiment.forecast import Setting
-from fieldtool.experiment.growth import GrowthWatch
+from fieldtool.experiment.multisine.growth import GrowthWatch
 from fieldtool.records.model import FloatArray
 from fieldtool.records.recording import Experiment
 

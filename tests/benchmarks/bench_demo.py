@@ -20,9 +20,9 @@ from drives.sim.lockstep_bus import register, unregister
 from drives.sim.machine import simulated_machine
 from fieldtool import workflow
 from fieldtool.experiment.forecast import AxisForecast
-from fieldtool.experiment.multisine_runner import MultisineProgress
-from fieldtool.experiment.plan import SweepPlan
-from fieldtool.experiment.runner import Progress
+from fieldtool.experiment.multisine.runner import MultisineProgress
+from fieldtool.experiment.stepped.plan import SweepPlan
+from fieldtool.experiment.stepped.runner import Progress
 from fieldtool.records.model import MachineModel
 from fieldtool.workflow import Options, Quiet, SessionResult
 from fieldtool.workflow.planning import PlannedFast

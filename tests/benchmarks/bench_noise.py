@@ -32,12 +32,12 @@ import numpy as np
 from drives.canopen_drive import connect
 from drives.profile import load_machine
 from fieldtool.errors import IdentificationError
-from fieldtool.experiment.fast import fast_cycle_times
-from fieldtool.experiment.multisine_forecast import predicted_phasors
-from fieldtool.identify.expected import Excitation, Noise, expected_accuracy
-from fieldtool.identify.joint import identify_joint
-from fieldtool.identify.least_squares import standard_errors
-from fieldtool.identify.refine import response_derivatives
+from fieldtool.experiment.multisine.design import fast_cycle_times
+from fieldtool.experiment.multisine.forecast import predicted_phasors
+from fieldtool.identify.likelihood.expected import Excitation, Noise, expected_accuracy
+from fieldtool.identify.likelihood.least_squares import standard_errors
+from fieldtool.identify.likelihood.refine import response_derivatives
+from fieldtool.identify.multisine.identify import identify_joint
 from fieldtool.records.model import Estimate
 from fieldtool.records.recording import AxisInfo, Experiment, Recording
 from fieldtool.workflow.models import truth_model

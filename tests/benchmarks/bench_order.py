@@ -4,7 +4,7 @@ Random machines with couplings, light dampers and some friction; responses on an
 noise of a measured torque.  A machine counts as seen when every mode's largest component stands
 ten standard errors out of the noise, by the information that its true modes have in the data.
 Two axes alone, coupled at their ends, are the same to both motors however the springs are split
-(:mod:`fieldtool.identify.order`): they have a row of their own.
+(:mod:`fieldtool.identify.chains.order`): they have a row of their own.
 
 Run: python tests/benchmarks/bench_order.py [machines] [seed]
 """
@@ -22,11 +22,11 @@ from scipy.linalg import eigh
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from fieldtool.errors import IdentificationError
-from fieldtool.identify.modal_chain import SEEN
-from fieldtool.identify.modal_model import ModalParts, modal_derivatives
-from fieldtool.identify.order import select_order
-from fieldtool.identify.refine import machine_response
-from fieldtool.identify.response_data import ResponseMatrix
+from fieldtool.identify.chains.modal_chain import SEEN
+from fieldtool.identify.chains.order import select_order
+from fieldtool.identify.likelihood.refine import machine_response
+from fieldtool.identify.likelihood.response_data import ResponseMatrix
+from fieldtool.identify.modes.model import ModalParts, modal_derivatives
 from tests.conftest import _random_model
 
 

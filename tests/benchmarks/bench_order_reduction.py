@@ -14,8 +14,8 @@ sys.path.insert(0, str(Path(__file__).parent))
 from exact_modes import exact_spectra, random_machine
 
 from fieldtool.errors import NotAChainError
-from fieldtool.identify.forward import gains
-from fieldtool.identify.order_reduction import (
+from fieldtool.identify.chains.forward import gains
+from fieldtool.identify.chains.order_reduction import (
     AxisModes,
     CrossGain,
     reduce_machine,

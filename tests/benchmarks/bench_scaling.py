@@ -27,12 +27,12 @@ from scipy.linalg import eigh
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from fieldtool.errors import IdentificationError
-from fieldtool.identify.block_reduction import reduce_blocks
-from fieldtool.identify.mode_search import find_modes
-from fieldtool.identify.modes import fit_modes
-from fieldtool.identify.parameters import machine_parameters, parameter_values
-from fieldtool.identify.refine import machine_response, refine
-from fieldtool.identify.response_data import ResponseMatrix
+from fieldtool.identify.chains.block_reduction import reduce_blocks
+from fieldtool.identify.likelihood.parameters import machine_parameters, parameter_values
+from fieldtool.identify.likelihood.refine import machine_response, refine
+from fieldtool.identify.likelihood.response_data import ResponseMatrix
+from fieldtool.identify.modes.fit import fit_modes
+from fieldtool.identify.modes.search import find_modes
 from fieldtool.records.model import Estimate
 from tests.conftest import _random_model
 

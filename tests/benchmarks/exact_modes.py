@@ -9,8 +9,8 @@ from decimal import Decimal, getcontext
 
 import numpy as np
 
-from fieldtool.identify.forward import spectra
-from fieldtool.identify.spectrum import Spectrum
+from fieldtool.identify.chains.forward import spectra
+from fieldtool.identify.chains.spectrum import Spectrum
 from fieldtool.records.model import AxisModel, Coupling, Estimate, MachineModel
 
 DIGITS = 60

@@ -11,11 +11,11 @@ from bench_demo import run
 from numpy.typing import NDArray
 
 from drives.profile import load_machine
-from fieldtool.frf.joint import joint_response
 from fieldtool.frf.matrix import column_responses
-from fieldtool.frf.multisine import analyse_multisine
-from fieldtool.identify.joint import matrix_of
-from fieldtool.identify.response_data import ResponseMatrix
+from fieldtool.frf.multisine.matrix import joint_response
+from fieldtool.frf.multisine.single_axis import analyse_multisine
+from fieldtool.identify.likelihood.response_data import ResponseMatrix
+from fieldtool.identify.multisine.identify import matrix_of
 from fieldtool.records.csv_folder import read_folder
 from fieldtool.records.model import MachineModel
 from fieldtool.records.recording import Recording, load

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 from peers_data import Case, ComplexArray
 
 from fieldtool.errors import IdentificationError
-from fieldtool.identify.block_reduction import reduce_blocks
-from fieldtool.identify.modal_model import ModalModel, ModalParts
-from fieldtool.identify.modes import rank_one
+from fieldtool.identify.chains.block_reduction import reduce_blocks
+from fieldtool.identify.modes.fit import rank_one
+from fieldtool.identify.modes.model import ModalModel, ModalParts
 from fieldtool.records.model import MachineModel
 
 EXACT = 1e-6

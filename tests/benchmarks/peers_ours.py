@@ -8,19 +8,19 @@ from peers_found import Found, Method
 from scipy.optimize import least_squares
 
 from fieldtool.errors import IdentificationError
-from fieldtool.identify.block_reduction import reduce_blocks
 from fieldtool.identify.chain import identify_chain
-from fieldtool.identify.joint import identify_joint
-from fieldtool.identify.modal_chain import reduce_modes
-from fieldtool.identify.modal_model import ModalModel
-from fieldtool.identify.modes import fit_modes
-from fieldtool.identify.parameters import (
+from fieldtool.identify.chains.block_reduction import reduce_blocks
+from fieldtool.identify.chains.modal_chain import reduce_modes
+from fieldtool.identify.likelihood.parameters import (
     Parameter,
     machine_parameters,
     parameter_values,
     with_values,
 )
-from fieldtool.identify.refine import machine_response, refine, response_derivatives
+from fieldtool.identify.likelihood.refine import machine_response, refine, response_derivatives
+from fieldtool.identify.modes.fit import fit_modes
+from fieldtool.identify.modes.model import ModalModel
+from fieldtool.identify.multisine.identify import identify_joint
 from fieldtool.records.model import AxisModel, Coupling, Estimate, MachineModel
 
 WRONG = 0.3

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from fieldtool.frf.matrix import column_responses
-from fieldtool.frf.multisine import MultisineResult, analyse_multisine
+from fieldtool.frf.multisine.single_axis import MultisineResult, analyse_multisine
 from fieldtool.identify.prediction import predict_load
 from fieldtool.records.csv_folder import read_folder
 from fieldtool.records.model import AxisModel, Estimate, MachineModel

@@ -5,9 +5,9 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from fieldtool.identify.forward import gains, spectra
-from fieldtool.identify.order_reduction import AxisModes, CrossGain, reduce_machine
-from fieldtool.identify.spectrum import Spectrum, without_cancelling_pairs
+from fieldtool.identify.chains.forward import gains, spectra
+from fieldtool.identify.chains.order_reduction import AxisModes, CrossGain, reduce_machine
+from fieldtool.identify.chains.spectrum import Spectrum, without_cancelling_pairs
 from fieldtool.records.model import AxisModel, Coupling, Estimate, MachineModel
 
 MASSES = ((0.7, 2, 3), (4, 5, 6), (7, 8, 9))

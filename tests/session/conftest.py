@@ -333,5 +333,5 @@ def profile_of_one() -> dict[str, Any]:
 @pytest.fixture
 def quick_plan(monkeypatch: pytest.MonkeyPatch) -> None:
     """A coarser first pass: enough for one chain of two masses, in a third of the time."""
-    monkeypatch.setattr("fieldtool.experiment.classic.GRID_RATIO", 1.25)
-    monkeypatch.setattr("fieldtool.experiment.classic.HIGH_TONES", 4)
+    monkeypatch.setattr("fieldtool.experiment.stepped.design.GRID_RATIO", 1.25)
+    monkeypatch.setattr("fieldtool.experiment.stepped.design.HIGH_TONES", 4)

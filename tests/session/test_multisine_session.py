@@ -14,14 +14,18 @@ from drives.sim.firmware import Parameter
 from fieldtool.errors import LoopUnstableError
 from fieldtool.experiment.axes import Axes
 from fieldtool.experiment.forecast import Setting
-from fieldtool.experiment.multisine import MultisinePlan, orthogonal_experiments, random_odd_lines
-from fieldtool.experiment.multisine_forecast import (
+from fieldtool.experiment.multisine.forecast import (
     experiment_peaks,
     forecast_multisine,
     predicted_phasors,
     scaled_to_limits,
 )
-from fieldtool.experiment.multisine_runner import run_multisine
+from fieldtool.experiment.multisine.plan import (
+    MultisinePlan,
+    orthogonal_experiments,
+    random_odd_lines,
+)
+from fieldtool.experiment.multisine.runner import run_multisine
 from fieldtool.records.closed_loop import ClosedLoop, loop_from_parameters
 from fieldtool.workflow.models import truth_model
 

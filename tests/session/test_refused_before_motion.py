@@ -19,11 +19,11 @@ from drives.sim.machine import simulated_machine
 from fieldtool.errors import FieldtoolError
 from fieldtool.experiment import directions
 from fieldtool.experiment.axes import Axes
-from fieldtool.experiment.classic import chosen_cycle_time, classic_plan
 from fieldtool.experiment.directions import check_directions
 from fieldtool.experiment.forecast import forecast
-from fieldtool.workflow.preparation import setting_of
+from fieldtool.experiment.stepped.design import chosen_cycle_time, classic_plan
 from fieldtool.workflow.models import prior_model
+from fieldtool.workflow.preparation import setting_of
 
 TABLE, ARM = 11, 12
 NO_OBJECT = 0x06020000
@@ -319,7 +319,7 @@ def limits_changed(make_bench, profile, changes, axis=0):
 
 def test_a_sweep_that_would_leave_the_travel_is_refused(bench, monkeypatch):
     """The plan's choice of amplitudes is wrong on purpose: the forecast is what refuses."""
-    monkeypatch.setattr("fieldtool.experiment.classic.SHARE_OF_LIMITS", 30.0)
+    monkeypatch.setattr("fieldtool.experiment.stepped.design.SHARE_OF_LIMITS", 30.0)
     outcome = bench.measure()
     assert outcome.code == 3, outcome.err
     assert "sweep table direct, others free: " in outcome.err

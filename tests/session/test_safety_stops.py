@@ -354,8 +354,8 @@ def test_axes_are_watched_while_they_are_being_enabled(bench, monkeypatch):
 
 def test_one_missing_pdo_is_tolerated_and_its_block_measured_again(small_bench):
     from fieldtool.experiment.axes import Axes
-    from fieldtool.experiment.plan import Sweep, SweepPlan, tone_near
-    from fieldtool.experiment.runner import run_plan
+    from fieldtool.experiment.stepped.plan import Sweep, SweepPlan, tone_near
+    from fieldtool.experiment.stepped.runner import run_plan
 
     bench = small_bench
     tone = tone_near(5.0, 0.05, 0.002)

@@ -5,9 +5,9 @@ import pytest
 from scipy.linalg import eigh
 
 from fieldtool.errors import NotAChainError, NotEnoughDataError
-from fieldtool.identify.block_lanczos import chain_rows
-from fieldtool.identify.block_reduction import reduce_blocks
-from fieldtool.identify.modal_model import ModalModel, ModalParts
+from fieldtool.identify.chains.block_lanczos import chain_rows
+from fieldtool.identify.chains.block_reduction import reduce_blocks
+from fieldtool.identify.modes.model import ModalModel, ModalParts
 from fieldtool.records.model import AxisModel, Coupling, Estimate, MachineModel
 
 

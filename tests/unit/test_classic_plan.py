@@ -13,7 +13,8 @@ import pytest
 
 from drives.api import AxisLimits
 from fieldtool.errors import PlanRefusedError
-from fieldtool.experiment.classic import (
+from fieldtool.experiment.forecast import Setting, forecast
+from fieldtool.experiment.stepped.design import (
     CYCLE_TIMES,
     CYCLES_A_PERIOD,
     HIGH,
@@ -23,8 +24,7 @@ from fieldtool.experiment.classic import (
     refined_plan,
     undamped_modes,
 )
-from fieldtool.experiment.forecast import Setting, forecast
-from fieldtool.experiment.plan import Sweep, SweepPlan, Tone
+from fieldtool.experiment.stepped.plan import Sweep, SweepPlan, Tone
 from fieldtool.records.closed_loop import AxisLoop
 from fieldtool.records.model import MachineModel
 

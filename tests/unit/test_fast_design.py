@@ -7,17 +7,17 @@ import pytest
 
 from drives.api import AxisLimits
 from fieldtool.errors import PlanRefusedError
-from fieldtool.experiment.fast import (
+from fieldtool.experiment.forecast import Setting
+from fieldtool.experiment.multisine.design import (
     SHAPES,
     experiments_for,
     fast_cycle_times,
     mode_band,
     with_bias,
 )
-from fieldtool.experiment.forecast import Setting
-from fieldtool.experiment.multisine import MultisineExperiment
-from fieldtool.identify.expected import Noise
-from fieldtool.identify.friction_left import DryFriction
+from fieldtool.experiment.multisine.plan import MultisineExperiment
+from fieldtool.identify.likelihood.expected import Noise
+from fieldtool.identify.multisine.dry_friction import DryFriction
 from fieldtool.records.closed_loop import AxisLoop, Biquad
 from fieldtool.records.model import AxisModel, Coupling, Estimate, MachineModel
 from fieldtool.workflow.planning import (

@@ -7,10 +7,10 @@ import pytest
 
 from fieldtool.errors import NotEnoughDataError
 from fieldtool.frf.held_targets import LINEAR_TARGETS, folded_phasors, held_offset
-from fieldtool.frf.joint import joint_response
-from fieldtool.frf.joint_input import check_saturation
-from fieldtool.frf.period import find_period, whole_periods
-from fieldtool.identify.refine import machine_response
+from fieldtool.frf.multisine.inputs import check_saturation
+from fieldtool.frf.multisine.matrix import joint_response
+from fieldtool.frf.multisine.period import find_period, whole_periods
+from fieldtool.identify.likelihood.refine import machine_response
 from fieldtool.records.closed_loop import AxisLoop, ClosedLoop
 from fieldtool.records.recorded import AxisInfo, Controller, Experiment, Recording
 

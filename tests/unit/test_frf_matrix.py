@@ -15,7 +15,7 @@ from fieldtool.frf.matrix import (
     solved_response,
 )
 from fieldtool.frf.phasors import Phasors
-from fieldtool.frf.stepped import stepped_responses
+from fieldtool.frf.stepped.responses import stepped_responses
 from fieldtool.records.recording import AxisInfo, Experiment, Recording, Segment
 
 AXES = ("a", "b", "c")

@@ -7,8 +7,8 @@ import pytest
 
 from fieldtool.errors import NotEnoughDataError
 from fieldtool.frf.matrix import column_responses
-from fieldtool.frf.multisine import MultisineResult, analyse_multisine
-from fieldtool.frf.periods import average_periods
+from fieldtool.frf.multisine.periods import average_periods
+from fieldtool.frf.multisine.single_axis import MultisineResult, analyse_multisine
 from fieldtool.records.recording import AxisInfo, Experiment, Recording
 
 N, PERIODS, RATE = 500, 12, 500.0

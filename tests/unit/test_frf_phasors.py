@@ -7,7 +7,7 @@ import pytest
 
 from fieldtool.errors import NotEnoughDataError
 from fieldtool.frf.phasors import fit_block, fit_sine, settled
-from fieldtool.frf.quality import distortion_share, judge
+from fieldtool.frf.stepped.quality import distortion_share, judge
 
 PERIOD = 0.004
 

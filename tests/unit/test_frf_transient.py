@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fieldtool.frf.transient import noise_covariance, steady_spectra
+from fieldtool.frf.multisine.transient import noise_covariance, steady_spectra
 from fieldtool.records.closed_loop import AxisLoop, ClosedLoop
 from fieldtool.records.model import AxisModel, Coupling, Estimate, MachineModel
 

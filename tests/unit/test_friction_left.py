@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fieldtool.frf.phasors import Phasors
-from fieldtool.identify.friction_left import dry_friction, without_dry_friction
+from fieldtool.identify.multisine.dry_friction import dry_friction, without_dry_friction
 from fieldtool.records.model import AxisModel, Estimate, MachineModel
 from fieldtool.records.recording import Experiment
 

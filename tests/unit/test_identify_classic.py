@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from fieldtool.errors import NotEnoughDataError
-from fieldtool.experiment.plan import tone_near
+from fieldtool.experiment.stepped.plan import tone_near
 from fieldtool.frf.matrix import column_responses
 from fieldtool.frf.phasors import Phasors
-from fieldtool.frf.stepped import SteppedResult
+from fieldtool.frf.stepped.responses import SteppedResult
 from fieldtool.identify.classic import held_gains, identify_classic, without_friction
 from fieldtool.records.closed_loop import AxisLoop, ClosedLoop
 from fieldtool.records.model import Estimate, MachineModel

@@ -7,19 +7,19 @@ import pytest
 from scipy.linalg import eigh
 
 from fieldtool.errors import NotEnoughDataError
-from fieldtool.identify.forward import spectra
-from fieldtool.identify.modal_chain import SEEN, reduce_modes, reduction_inputs
-from fieldtool.identify.modal_model import (
+from fieldtool.identify.chains.forward import spectra
+from fieldtool.identify.chains.modal_chain import SEEN, reduce_modes, reduction_inputs
+from fieldtool.identify.likelihood.refine import machine_response
+from fieldtool.identify.likelihood.response_data import ResponseMatrix
+from fieldtool.identify.modes.fit import fit_modes
+from fieldtool.identify.modes.model import (
     ModalParts,
     modal_derivatives,
     modal_response,
     take_apart,
 )
-from fieldtool.identify.modal_sum_rule import sum_rule, sum_rule_jacobian
-from fieldtool.identify.modes import fit_modes
-from fieldtool.identify.pole_search import Responses, find_poles, start_poles
-from fieldtool.identify.refine import machine_response
-from fieldtool.identify.response_data import ResponseMatrix
+from fieldtool.identify.modes.poles import Responses, find_poles, start_poles
+from fieldtool.identify.modes.sum_rule import sum_rule, sum_rule_jacobian
 from fieldtool.records.model import AxisModel, Coupling, Estimate, MachineModel
 
 LENGTHS = {"branch 1": 3, "branch 2": 3, "branch 3": 3}

@@ -9,9 +9,9 @@ import pytest
 from scipy.linalg import expm
 
 from fieldtool.errors import NotEnoughDataError
-from fieldtool.identify.least_squares import standard_errors
-from fieldtool.identify.moves import identify_moves
-from fieldtool.identify.parameters import machine_parameters, parameter_values
+from fieldtool.identify.likelihood.least_squares import standard_errors
+from fieldtool.identify.likelihood.parameters import machine_parameters, parameter_values
+from fieldtool.identify.moves.identify import identify_moves
 from fieldtool.records.csv_folder import read_folder
 from fieldtool.records.model import Estimate, MachineModel
 from fieldtool.records.recording import AxisInfo, Controller, Experiment, Recording

@@ -10,16 +10,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fieldtool.errors import NotAChainError
-from fieldtool.identify.forward import gains, spectra
-from fieldtool.identify.lanczos import lanczos_step
-from fieldtool.identify.order_reduction import (
+from fieldtool.identify.chains.forward import gains, spectra
+from fieldtool.identify.chains.lanczos import lanczos_step
+from fieldtool.identify.chains.order_reduction import (
     AxisModes,
     CrossGain,
     coupling_from_gains,
     reduce_chain,
     reduce_machine,
 )
-from fieldtool.identify.spectrum import Spectrum
+from fieldtool.identify.chains.spectrum import Spectrum
 from fieldtool.records.model import AxisModel, Estimate, MachineModel
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"

@@ -7,9 +7,13 @@ import pytest
 
 from fieldtool.errors import NotEnoughDataError
 from fieldtool.identify.features import chain_features
-from fieldtool.identify.parameters import machine_parameters, parameter_values, with_values
-from fieldtool.identify.refine import machine_response, refine, response_derivatives
-from fieldtool.identify.response_data import ResponseMatrix
+from fieldtool.identify.likelihood.parameters import (
+    machine_parameters,
+    parameter_values,
+    with_values,
+)
+from fieldtool.identify.likelihood.refine import machine_response, refine, response_derivatives
+from fieldtool.identify.likelihood.response_data import ResponseMatrix
 from fieldtool.records.model import AxisModel, Coupling, Estimate, MachineModel
 
 

@@ -8,9 +8,9 @@ from scipy.linalg import expm
 from scipy.signal import butter, lfilter
 
 from fieldtool.errors import NotEnoughDataError
-from fieldtool.identify.least_squares import standard_errors
-from fieldtool.identify.parameters import machine_parameters, parameter_values
-from fieldtool.identify.spectra import Spectra, TorquePart, refine_spectra, torque_residuals
+from fieldtool.identify.likelihood.least_squares import standard_errors
+from fieldtool.identify.likelihood.parameters import machine_parameters, parameter_values
+from fieldtool.identify.moves.spectra import Spectra, TorquePart, refine_spectra, torque_residuals
 from fieldtool.records.model import Estimate, MachineModel
 
 STEP, ROWS, TOP = 0.001, 6000, 30.0

@@ -5,8 +5,8 @@ import pytest
 from scipy.linalg import eigh
 
 from fieldtool.errors import NotAChainError
-from fieldtool.identify.forward import gains, spectra
-from fieldtool.identify.spectrum import Spectrum, without_cancelling_pairs
+from fieldtool.identify.chains.forward import gains, spectra
+from fieldtool.identify.chains.spectrum import Spectrum, without_cancelling_pairs
 from fieldtool.records.model import AxisModel, Coupling, Estimate, MachineModel
 
 

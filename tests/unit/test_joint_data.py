@@ -8,10 +8,10 @@ import pytest
 
 from fieldtool.errors import NotEnoughDataError
 from fieldtool.frf.phasors import Phasors
-from fieldtool.identify.expected import Excitation, Expected, Noise, expected_accuracy
-from fieldtool.identify.joint_data import frequencies_of, joint_spectra
-from fieldtool.identify.model_band import relative_std
-from fieldtool.identify.refine import RefinedModel, machine_response, refine
+from fieldtool.identify.likelihood.expected import Excitation, Expected, Noise, expected_accuracy
+from fieldtool.identify.likelihood.joint_data import frequencies_of, joint_spectra
+from fieldtool.identify.likelihood.model_band import relative_std
+from fieldtool.identify.likelihood.refine import RefinedModel, machine_response, refine
 from fieldtool.records.model import Estimate, MachineModel
 
 RandomModel = Callable[..., MachineModel]
@@ -173,7 +173,11 @@ def test_the_band_of_a_model_is_the_scatter_of_machines_drawn_from_it(
     found = fitted(model, phasors)
     omega = band(model, 7)
     claimed = relative_std(found, omega)
-    from fieldtool.identify.parameters import machine_parameters, parameter_values, with_values
+    from fieldtool.identify.likelihood.parameters import (
+        machine_parameters,
+        parameter_values,
+        with_values,
+    )
 
     every = machine_parameters(found.model, omega)
     delays = [d.value for d in found.delays]

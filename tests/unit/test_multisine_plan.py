@@ -9,19 +9,19 @@ import pytest
 from drives.api import AxisLimits
 from fieldtool.errors import PlanRefusedError
 from fieldtool.experiment.forecast import Setting
-from fieldtool.experiment.multisine import (
-    MultisineExperiment,
-    MultisinePlan,
-    orthogonal_experiments,
-    random_odd_lines,
-)
-from fieldtool.experiment.multisine_forecast import (
+from fieldtool.experiment.multisine.forecast import (
     experiment_peaks,
     forecast_multisine,
     predicted_phasors,
     scaled_to_limits,
 )
-from fieldtool.experiment.phases import crest_factors, low_crest, orthogonal_phases
+from fieldtool.experiment.multisine.phases import crest_factors, low_crest, orthogonal_phases
+from fieldtool.experiment.multisine.plan import (
+    MultisineExperiment,
+    MultisinePlan,
+    orthogonal_experiments,
+    random_odd_lines,
+)
 from fieldtool.records.closed_loop import AxisLoop, Biquad
 from fieldtool.records.model import MachineModel
 

@@ -15,14 +15,14 @@ from drives.api import AxisLimits, Capture, Source, Targets, joined
 from drives.errors import SafetyStopError, UserStopError
 from fieldtool.errors import LoopUnstableError, NotEnoughDataError
 from fieldtool.experiment.axes import Axes
-from fieldtool.experiment.clipping import clipped_samples
-from fieldtool.experiment.growth import GrowthWatch
-from fieldtool.experiment.multisine import (
+from fieldtool.experiment.multisine.clipping import clipped_samples
+from fieldtool.experiment.multisine.growth import GrowthWatch
+from fieldtool.experiment.multisine.plan import (
     MultisinePlan,
     orthogonal_experiments,
     random_odd_lines,
 )
-from fieldtool.experiment.multisine_runner import MultisineProgress, run_multisine
+from fieldtool.experiment.multisine.runner import MultisineProgress, run_multisine
 from fieldtool.records.closed_loop import AxisLoop, ClosedLoop
 from fieldtool.records.model import AxisModel, Coupling, Estimate, MachineModel
 from fieldtool.records.recording import Experiment

@@ -7,10 +7,10 @@ import pytest
 from scipy.linalg import eigh
 
 from fieldtool.errors import IdentificationError, NotEnoughDataError
-from fieldtool.identify.mode_search import find_modes
-from fieldtool.identify.order import select_order
-from fieldtool.identify.refine import machine_response
-from fieldtool.identify.response_data import ResponseMatrix
+from fieldtool.identify.chains.order import select_order
+from fieldtool.identify.likelihood.refine import machine_response
+from fieldtool.identify.likelihood.response_data import ResponseMatrix
+from fieldtool.identify.modes.search import find_modes
 from fieldtool.records.model import AxisModel, Coupling, Estimate, MachineModel
 
 

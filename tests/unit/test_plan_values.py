@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fieldtool.experiment.plan import (
+from fieldtool.experiment.stepped.plan import (
     BLOCK_CYCLES,
     Sweep,
     SweepPlan,

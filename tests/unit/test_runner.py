@@ -17,8 +17,8 @@ from drives.api import AxisLimits, Capture, Source, joined
 from drives.errors import SafetyStopError, UserStopError
 from fieldtool.experiment.axes import Axes
 from fieldtool.experiment.directions import check_directions
-from fieldtool.experiment.plan import Sweep, SweepPlan, Tone, tone_near, transition
-from fieldtool.experiment.runner import DRIFTED, OVERLOAD, Progress, run_plan
+from fieldtool.experiment.stepped.plan import Sweep, SweepPlan, Tone, tone_near, transition
+from fieldtool.experiment.stepped.runner import DRIFTED, OVERLOAD, Progress, run_plan
 from fieldtool.records.closed_loop import AxisLoop, ClosedLoop
 from fieldtool.records.model import AxisModel, Coupling, Estimate, MachineModel
 from fieldtool.records.recording import Experiment

@@ -12,8 +12,8 @@ from rich.console import Console
 from fieldtool.cli.screen import TerminalScreen, model_table, parameter_rows, show_result
 from fieldtool.design.tuning import design
 from fieldtool.experiment.forecast import AxisForecast
-from fieldtool.experiment.plan import Sweep, SweepPlan, tone_near
-from fieldtool.experiment.runner import Progress
+from fieldtool.experiment.stepped.plan import Sweep, SweepPlan, tone_near
+from fieldtool.experiment.stepped.runner import Progress
 from fieldtool.records.model import AxisModel, Coupling, Estimate, MachineModel
 from fieldtool.workflow import SessionResult
 from fieldtool.writeback.transaction import WriteBack

@@ -1,0 +1,1 @@
+"""The fast plan: its design, what is sent, its forecast and its run."""

@@ -1,0 +1,1 @@
+"""The classic plan: its design, its tones and its run."""

@@ -1,0 +1,1 @@
+"""From periodic recordings to phasors, responses, noise and distortion."""

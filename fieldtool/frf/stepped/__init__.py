@@ -1,0 +1,1 @@
+"""Responses and their quality from stepped sines."""

@@ -1,0 +1,1 @@
+"""Machines from recordings without a period."""

@@ -1,0 +1,245 @@
+"""What a short, weak measurement tells, so that the main one can be planned: noise, friction, modes."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import nnls
+
+from fieldtool.errors import IdentificationError, NotEnoughDataError
+from fieldtool.frf.phasors import Phasors
+from fieldtool.identify.chains.forward import spectra
+from fieldtool.identify.likelihood.expected import Noise
+from fieldtool.identify.likelihood.joint_data import frequencies_of, joint_spectra
+from fieldtool.identify.likelihood.refine import RefinedModel, machine_response, refine
+from fieldtool.identify.multisine.dry_friction import (
+    DryFriction,
+    dry_friction,
+    without_dry_friction,
+)
+from fieldtool.identify.multisine.identify import phasors_of
+from fieldtool.identify.multisine.records import settled, with_periods
+from fieldtool.records.model import Estimate, FloatArray, MachineModel
+from fieldtool.records.recording import Experiment, Recording
+
+TRUST = {"mass": 0.7, "spring": 0.7, "damper": 1.0}
+"""Relative standard error of the machine as last accepted: new tooling changes a lot."""
+WEIGHTINGS = 2
+"""Fits, each weighted with the response of the one before."""
+POOR_FIT = 30.0
+"""Misfit over noise above which the pilot's model is not used."""
+BEYOND = 2.0
+"""Factor by which a mode may lie outside the pilot's lines and still be believed."""
+SMALLEST = 1e-12
+"""rad or m: noise of a position that shows none."""
+FRICTION_ROUNDS = 6
+"""Of fitting anew without dry friction, at most."""
+FRICTION_TAKEN = 2.0
+"""Standard errors from which dry friction is taken off before the next fit: a model that was fitted
+with it hides a part of it, and the rest stands out more from one fit to the next."""
+FRICTION_SETTLED = 0.02
+"""Relative change of the friction from one fit to the next, below which no other follows."""
+FRICTION_SEEN = 5.0
+"""Standard errors from which dry friction counts as seen."""
+
+
+@dataclass(frozen=True, eq=False)
+class PilotFindings:
+    """What the pilot found."""
+
+    model: MachineModel
+    """The machine by the pilot, or as last accepted where the pilot can not tell."""
+    noise: Noise
+    """Of single samples."""
+    friction: DryFriction | None
+    """None where the model does not explain the pilot."""
+    notes: tuple[str, ...]
+
+
+def read_pilot(recording: Recording, prior: MachineModel) -> PilotFindings:
+    """Read noise, friction and modes from the multisine experiments of a recording.
+
+    Parameters
+    ----------
+    recording
+        Whose multisine experiments are the pilot.
+    prior
+        The machine as last accepted: chain lengths, and start of the fit.
+
+    Raises
+    ------
+    NotEnoughDataError
+        If there is no multisine, or nothing moved.
+    """
+    recording = with_periods(recording)
+    experiments = [e for e in recording.experiments if e.kind == "multisine" and e.complete]
+    if not experiments:
+        raise NotEnoughDataError("there is no complete multisine experiment to be read as a pilot")
+    phasors = phasors_of(recording, experiments)
+    step = recording.sample_period
+    notes: list[str] = []
+    explained = _explained(phasors, experiments, step, prior, notes)
+    if explained is None:
+        noise = _noise(phasors, experiments, step, prior, np.zeros(len(prior.axes)))
+        return PilotFindings(prior, noise, None, tuple(notes))
+    fitted, friction = explained
+    noise = _noise(phasors, experiments, step, fitted.model, _delays(fitted))
+    for k in friction.seen(FRICTION_SEEN):
+        unit = recording.axes[k].torque_unit
+        one = friction.torque[k]
+        notes.append(
+            f"{friction.axes[k]}: dry friction of {one.value:.2g} +- {1.96 * one.std:.1g} {unit}, "
+            f"{100 * friction.share[k]:.0f} % of the pilot's torque."
+        )
+    return PilotFindings(fitted.model, noise, friction, tuple(notes))
+
+
+def _explained(
+    phasors: Sequence[Phasors],
+    experiments: Sequence[Experiment],
+    step: float,
+    prior: MachineModel,
+    notes: list[str],
+) -> tuple[RefinedModel, DryFriction] | None:
+    """Fit a model and dry friction in turn: friction that is likely is taken off before the next fit.
+
+    None where no model explains the pilot; why is added to the notes.
+    """
+    steady = [settled(one, step) for one in experiments]
+    band = (
+        min(float(p.frequencies.min()) for p in phasors),
+        max(float(p.frequencies.max()) for p in phasors),
+    )
+    found: tuple[RefinedModel, DryFriction] | None = None
+    freed, taken, said = phasors, np.zeros(len(prior.axes)), list[str]()
+    for _ in range(1 + FRICTION_ROUNDS):
+        said = []
+        fitted = _fitted(freed, prior, said)
+        if fitted is None:
+            break
+        friction = dry_friction(steady, step, band, fitted.model, _delays(fitted))
+        found = fitted, friction
+        likely = friction.seen(FRICTION_TAKEN)
+        new = np.array([one.value if k in likely else 0.0 for k, one in enumerate(friction.torque)])
+        if np.all(np.abs(new - taken) <= FRICTION_SETTLED * np.abs(new)):
+            break
+        taken = new
+        freed = without_dry_friction(phasors, steady, step, taken.tolist())
+    notes += said
+    return found
+
+
+def measured_noise(recording: Recording, model: MachineModel) -> Noise:
+    """Return the noise of single samples that a recording's multisines show.
+
+    Raises
+    ------
+    NotEnoughDataError
+        If there is no complete multisine, or none with two whole periods.
+    """
+    recording = with_periods(recording)
+    experiments = [e for e in recording.experiments if e.kind == "multisine" and e.complete]
+    if not experiments:
+        raise NotEnoughDataError("there is no complete multisine experiment that tells the noise")
+    phasors = phasors_of(recording, experiments)
+    still = np.zeros(len(model.axes))
+    return _noise(phasors, experiments, recording.sample_period, model, still)
+
+
+def _noise(
+    phasors: Sequence[Phasors],
+    experiments: Sequence[Experiment],
+    sample_period: float,
+    model: MachineModel,
+    delays: FloatArray,
+) -> Noise:
+    """Standard deviations of single samples that explain the scatter of the equation error.
+
+    What noise makes the loops do is in torque and position alike and tells as much as excitation;
+    what counts is the scatter of Theta - G T, here put down to independent noise of both.
+    """
+    axes = len(model.axes)
+    rows, sides = [], []
+    for one, experiment in zip(phasors, experiments, strict=True):
+        samples = round(float(experiment.period or 0.0) / sample_period)
+        counted = experiment.samples // samples * samples
+        response = machine_response(model, 2 * np.pi * one.frequencies, delays)
+        mixing = np.concatenate([np.broadcast_to(np.eye(axes), response.shape), -response], axis=2)
+        error = np.einsum("fia,fab,fib->fi", mixing, one.covariance, mixing.conj()).real
+        passed = np.concatenate(
+            [np.abs(response) ** 2, np.broadcast_to(np.eye(axes), response.shape)], axis=2
+        )
+        rows.append((passed / error[:, :, None]).reshape(-1, 2 * axes))
+        sides.append(np.full(error.size, counted / 4))
+    matrix = np.vstack(rows)
+    scale = np.linalg.norm(matrix, axis=0)
+    variance = nnls(matrix / scale, np.concatenate(sides))[0] / scale
+    std = np.sqrt(variance)
+    return Noise(torque=std[:axes], position=np.maximum(std[axes:], SMALLEST))
+
+
+def _fitted(
+    phasors: Sequence[Phasors], prior: MachineModel, notes: list[str]
+) -> RefinedModel | None:
+    omega = frequencies_of(phasors)
+    model, delays = prior, np.zeros(len(prior.axes))
+    found: RefinedModel | None = None
+    try:
+        for _ in range(WEIGHTINGS):
+            data = joint_spectra(phasors, machine_response(model, omega, delays))
+            found = refine(
+                model,
+                data,
+                priors=_trusted(prior),
+                fit_delay=True,
+                fit_friction=True,
+                delays=delays.tolist(),
+            )
+            model, delays = found.model, _delays(found)
+    except IdentificationError as error:
+        notes.append(
+            f"The pilot can not be explained ({error}); the plan rests on the prior model."
+        )
+        return None
+    if found is not None and found.chi2 > POOR_FIT * found.degrees_of_freedom:
+        misfit = np.sqrt(found.chi2 / found.degrees_of_freedom)
+        notes.append(
+            f"The pilot differs from what masses and springs explain by {misfit:.0f} times its noise; "
+            "friction, or another number of masses? The plan goes on with the nearest model."
+        )
+    if found is not None and not _in_band(found.model, omega):
+        notes.append(
+            "The pilot puts modes far outside its band, so its model is not used; the plan rests on the "
+            "prior model. Another number of masses than the profile says?"
+        )
+        return None
+    return found
+
+
+def _in_band(model: MachineModel, omega: FloatArray) -> bool:
+    """Whether all springs' modes lie where the pilot could see them."""
+    try:
+        every = [one.resonances[1:] for one in spectra(model)]
+    except ValueError:
+        return False
+    modes = np.sqrt(np.concatenate([*every, np.zeros(0)]))
+    return bool(np.all((modes > omega[0] / BEYOND) & (modes < BEYOND * omega[-1])))
+
+
+def _trusted(prior: MachineModel) -> dict[str, Estimate]:
+    known = {}
+    for axis in prior.axes:
+        for kind, values in (
+            ("mass", axis.masses),
+            ("spring", axis.springs),
+            ("damper", axis.dampers),
+        ):
+            for k, value in enumerate(values):
+                if value.value > 0:
+                    std = TRUST[kind] * value.value
+                    known[f"{axis.name}.{kind}[{k + 1}]"] = Estimate(value.value, std)
+    return known
+
+
+def _delays(fitted: RefinedModel) -> FloatArray:
+    return np.array([delay.value for delay in fitted.delays])
