@@ -325,6 +325,11 @@ def model_table(
             Estimate(true_value) if true_value is not None else None,
             truth,
         )
+    for effect in model.effects:
+        words = str(effect["effect"]).replace("_", " ")
+        for name, found in effect["parameters"].items():
+            value = Estimate(float(found["value"]), float(found.get("std", float("nan"))))
+            _row(table, str(effect["axis"]), f"{words}, {name}", value, found["unit"], None, truth)
     return table
 
 

@@ -41,6 +41,8 @@ from fieldtool.frf.phasors import ComplexArray, FloatArray, Phasors
 from fieldtool.frf.response import FrequencyResponse
 from fieldtool.records.recorded import Experiment, Recording
 
+_ENOUGH = 3
+"""Periods from which transients are told well from what repeats."""
 _TOO_MUCH = 0.3
 """Share of transients in a signal that is worth a word."""
 _CLEAR = 5.0
@@ -126,9 +128,11 @@ def _notes(measured: Sequence[LinePhasors], left_out: int) -> list[str]:
     notes = []
     largest = max(one.transient for one in measured)
     if largest > _TOO_MUCH and not any(_drifts(one.given.experiment) for one in measured):
+        few = min(one.given.periods for one in measured) < _ENOUGH
+        price = "errors may be larger than their intervals say" if few else "intervals are wider for it"
         notes.append(
-            f"Transients of up to {100 * largest:.0f} % of the signals were taken out: the intervals "
-            "are wider for it. More time (--time) would lessen them."
+            f"Transients of up to {100 * largest:.0f} % of the signals were taken out: {price}. More "
+            "time (--time) would lessen them."
         )
     if left_out:
         notes.append(
