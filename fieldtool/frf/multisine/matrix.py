@@ -129,7 +129,9 @@ def _notes(measured: Sequence[LinePhasors], left_out: int) -> list[str]:
     largest = max(one.transient for one in measured)
     if largest > _TOO_MUCH and not any(_drifts(one.given.experiment) for one in measured):
         few = min(one.given.periods for one in measured) < _ENOUGH
-        price = "errors may be larger than their intervals say" if few else "intervals are wider for it"
+        price = (
+            "errors may be larger than their intervals say" if few else "intervals are wider for it"
+        )
         notes.append(
             f"Transients of up to {100 * largest:.0f} % of the signals were taken out: {price}. More "
             "time (--time) would lessen them."
