@@ -43,8 +43,8 @@ from fieldtool.records.recorded import Experiment, Recording
 
 _ENOUGH = 3
 """Periods from which transients are told well from what repeats."""
-_TOO_MUCH = 0.3
-"""Share of transients in a signal that is worth a word."""
+_TOO_MUCH, _TOO_MUCH_OF_FEW = 0.3, 0.03
+"""Share of transients in a signal that is worth a word, and where there are fewer periods."""
 _CLEAR = 5.0
 """Weakest direction of the torques over its noise, below it a line is left out."""
 
@@ -127,8 +127,9 @@ def _chosen(recording: Recording) -> list[Experiment]:
 def _notes(measured: Sequence[LinePhasors], left_out: int) -> list[str]:
     notes = []
     largest = max(one.transient for one in measured)
-    if largest > _TOO_MUCH and not any(_drifts(one.given.experiment) for one in measured):
-        few = min(one.given.periods for one in measured) < _ENOUGH
+    few = min(one.given.periods for one in measured) < _ENOUGH
+    allowed = _TOO_MUCH_OF_FEW if few else _TOO_MUCH
+    if largest > allowed and not any(_drifts(one.given.experiment) for one in measured):
         price = (
             "errors may be larger than their intervals say" if few else "intervals are wider for it"
         )
@@ -146,10 +147,11 @@ def _notes(measured: Sequence[LinePhasors], left_out: int) -> list[str]:
 
 def _drifts(experiment: Experiment) -> bool:
     """Whether an axis ends far from where it began: a constant velocity is no transient."""
+    position = experiment.position
     quarter = experiment.samples // 4
-    first, last = experiment.position[:quarter], experiment.position[-quarter:]
-    moved = np.abs(last.mean(axis=0) - first.mean(axis=0))
-    return bool(np.any(moved > np.ptp(first, axis=0)))
+    moved = np.abs(position[-quarter:].mean(axis=0) - position[:quarter].mean(axis=0))
+    swing = np.ptp(position[:quarter], axis=0) + np.ptp(position[-quarter:], axis=0)
+    return bool(np.any(moved > swing))
 
 
 def solve_set(members: Sequence[LinePhasors], axes: tuple[str, ...]) -> SetResponse:
