@@ -212,7 +212,8 @@ def test_folded_images_of_linear_targets_are_taken_off(fresh_rng, random_model):
     experiments = []
     for number, reference in enumerate(bench.references):
         position, torque = bench.closed.simulate(reference, STEP)
-        late = np.vstack([reference[1:], reference[-1:]])  # sent one SYNC before it is reached
+        again = reference[-round(PERIOD / STEP)]  # what follows the last row
+        late = np.vstack([reference[1:], again[None]])  # sent one SYNC before it is reached
         experiments.append(
             Experiment(
                 f"m{number}", "multisine", names, (), PERIOD, np.arange(len(late)) * STEP,
