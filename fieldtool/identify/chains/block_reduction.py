@@ -29,6 +29,10 @@ from fieldtool.identify.modes.model import ModalModel
 from fieldtool.records.model import AxisModel, Coupling, Estimate, Kind, MachineModel
 
 FloatArray = NDArray[np.float64]
+NO_MASS = (
+    "the rigid body of the fitted modes has no positive mass in every direction; measure lower "
+    "frequencies, and check the signs of torque and position on each axis"
+)
 STEP = 1e-5
 """Relative, of central differences."""
 
@@ -170,10 +174,7 @@ class _Variants:
             or not size.all()
             or not np.linalg.eigvalsh(modal.rigid / np.outer(size, size))[0] > 0.0
         ):
-            raise NotAChainError(
-                "the rigid body of the fitted modes has no positive mass in every direction; "
-                "measure lower frequencies, and check the signs of torque and position on each axis"
-            )
+            raise NotAChainError(NO_MASS)
         scales = np.r_[
             modal.omega,
             np.repeat(np.hypot(np.abs(modal.phi).max(axis=1, initial=0.0), size), modes),
@@ -186,7 +187,10 @@ class _Variants:
         rigid = np.empty((x.shape[0], axes, axes))
         rigid[:, i, j] = rigid[:, j, i] = x[:, modes + axes * modes :]
         resonances = np.hstack([np.zeros((x.shape[0], axes)), x[:, :modes] ** 2])
-        motors = np.concatenate([np.linalg.cholesky(rigid), phi], axis=2)
+        try:
+            motors = np.concatenate([np.linalg.cholesky(rigid), phi], axis=2)
+        except np.linalg.LinAlgError as error:  # all but singular: a step away it is
+            raise NotAChainError(NO_MASS) from error
         return cls(resonances, motors, steps, columns)
 
     def derivatives(self, results: FloatArray) -> FloatArray:
