@@ -219,7 +219,7 @@ def _refined(
     """Fit everything to all points, starting from the order reduction; keep that if they disagree."""
     try:
         fitted = refine(reduced, data, fit_friction=modal.parts.friction)
-        unseen = _without_friction_seen(fitted.model) if modal.parts.friction else ()
+        unseen = without_friction_seen(fitted.model) if modal.parts.friction else ()
         if unseen:
             fixed = [f"{name}.viscous_friction" for name in unseen]
             start = without_friction(fitted.model, unseen)
@@ -237,7 +237,7 @@ def _refined(
     return fitted.model, notes
 
 
-def _without_friction_seen(model: MachineModel) -> tuple[str, ...]:
+def without_friction_seen(model: MachineModel) -> tuple[str, ...]:
     """Return the axes whose friction at the motor can not be told from none."""
     return tuple(
         axis.name

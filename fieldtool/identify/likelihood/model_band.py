@@ -27,7 +27,7 @@ def relative_std(fitted: RefinedModel, omega: FloatArray) -> FloatArray:
     known = np.isfinite(np.diag(fitted.covariance))
     chosen = [by_name[n] for n, k in zip(fitted.names, known, strict=True) if k]
     covariance = fitted.covariance[np.ix_(known, known)]
-    delays = np.array([d.value for d in fitted.delays])
+    delays = fitted.delay_values
     response = machine_response(fitted.model, omega, delays)
     derivatives = response_derivatives(fitted.model, omega, delays, chosen)
     growth = np.real(derivatives * np.conj(response)[..., None]) / np.abs(response)[..., None] ** 2

@@ -71,6 +71,11 @@ class RefinedModel:
     """What the data cannot tell."""
 
     @property
+    def delay_values(self) -> FloatArray:
+        """Delays without their errors, shape (M,), s."""
+        return np.array([delay.value for delay in self.delays])
+
+    @property
     def correlation(self) -> FloatArray:
         """Of the fitted parameters, shape (P, P)."""
         std = standard_errors(self.covariance)

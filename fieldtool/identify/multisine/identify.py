@@ -22,6 +22,7 @@ from fieldtool.frf.response import FrequencyResponse
 from fieldtool.identify.chains.block_reduction import BlockReduced, reduce_blocks
 from fieldtool.identify.chains.modal_chain import reduce_modes
 from fieldtool.identify.chains.order import OrderSelection, select_order
+from fieldtool.identify.classic import without_friction, without_friction_seen
 from fieldtool.identify.likelihood.joint_data import frequencies_of, joint_spectra
 from fieldtool.identify.likelihood.refine import RefinedModel, machine_response, refine
 from fieldtool.identify.likelihood.response_data import ResponseMatrix
@@ -34,7 +35,7 @@ from fieldtool.identify.multisine.dry_friction import (
     without_dry_friction,
 )
 from fieldtool.identify.multisine.records import check_alive, moving_on, settled, with_periods
-from fieldtool.records.model import Estimate, FloatArray, Kind, MachineModel
+from fieldtool.records.model import Estimate, Kind, MachineModel
 from fieldtool.records.recording import Experiment, Recording
 
 WEIGHTINGS = 2
@@ -45,8 +46,6 @@ DELAY_SHARE = 0.05
 """Of the sample period: a smaller delay between torque and position is one of sampling, no effect."""
 FRICTION_ROUNDS = 3
 """Of estimating dry friction and fitting without it."""
-SIGNIFICANT = 3.0
-"""Standard errors above which viscous friction counts as seen."""
 DISAGREEMENT = 5.0
 """Standard errors between two ways to one number above which a note is made."""
 WORTH = 25.0
@@ -355,7 +354,7 @@ class _Fit:
 
     def unexplained(self, fitted: RefinedModel) -> float:
         """Return the share of the motion, in standard errors, that the machine does not explain."""
-        response = machine_response(fitted.model, self._omega, _delays(fitted))
+        response = machine_response(fitted.model, self._omega, fitted.delay_values)
         data = joint_spectra(self._phasors, response)
         left, moved = data.residuals(response), data.residuals(np.zeros_like(response))
         return float(np.linalg.norm(left) / np.linalg.norm(moved))
@@ -363,14 +362,14 @@ class _Fit:
     def _friction(self, fitted: RefinedModel) -> DryFriction:
         band = (float(self._omega[0] / (2 * np.pi)), float(self._omega[-1] / (2 * np.pi)))
         settled_ones = list(self._settled.values())
-        return dry_friction(settled_ones, self._step, band, fitted.model, _delays(fitted))
+        return dry_friction(settled_ones, self._step, band, fitted.model, fitted.delay_values)
 
     def _weighted(self, start: RefinedModel, phasors: Sequence[Phasors]) -> RefinedModel:
         """Fit, each time weighted anew, then once more without friction that is not seen."""
         found = start
         for _ in range(WEIGHTINGS):
             found = self._once(found, phasors, ())
-        unseen = _unseen(found.model)
+        unseen = without_friction_seen(found.model)
         if unseen:
             found = self._once(found, phasors, unseen)
         loads = self._once(found, phasors, unseen, loads=True)
@@ -384,8 +383,8 @@ class _Fit:
         *,
         loads: bool = False,
     ) -> RefinedModel:
-        response = machine_response(start.model, self._omega, _delays(start))
-        model = _frictionless(start.model, without)
+        response = machine_response(start.model, self._omega, start.delay_values)
+        model = without_friction(start.model, without)
         return refine(
             model,
             joint_spectra(phasors, response),
@@ -394,29 +393,8 @@ class _Fit:
             fit_delay=True,
             fit_friction=True,
             fit_load_friction=loads,
-            delays=_delays(start).tolist(),
+            delays=start.delay_values.tolist(),
         )
-
-
-def _delays(fitted: RefinedModel) -> FloatArray:
-    return np.array([delay.value for delay in fitted.delays])
-
-
-def _unseen(model: MachineModel) -> tuple[str, ...]:
-    """Return the axes whose viscous friction can not be told from none."""
-    return tuple(
-        axis.name
-        for axis in model.axes
-        if axis.viscous_friction.value <= SIGNIFICANT * axis.viscous_friction.std
-    )
-
-
-def _frictionless(model: MachineModel, names: Sequence[str]) -> MachineModel:
-    axes = tuple(
-        replace(axis, viscous_friction=Estimate(0.0)) if axis.name in names else axis
-        for axis in model.axes
-    )
-    return replace(model, axes=axes)
 
 
 def _still_loads(model: MachineModel) -> MachineModel:

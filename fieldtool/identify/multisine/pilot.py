@@ -27,7 +27,7 @@ TRUST = {"mass": 0.7, "spring": 0.7, "damper": 1.0}
 WEIGHTINGS = 2
 """Fits, each weighted with the response of the one before."""
 POOR_FIT = 30.0
-"""Misfit over noise above which the pilot's model is not used."""
+"""Misfit (chi2 over degrees of freedom) above which it is said that the model is only the nearest."""
 BEYOND = 2.0
 """Factor by which a mode may lie outside the pilot's lines and still be believed."""
 SMALLEST = 1e-12
@@ -83,7 +83,7 @@ def read_pilot(recording: Recording, prior: MachineModel) -> PilotFindings:
         noise = _noise(phasors, experiments, step, prior, np.zeros(len(prior.axes)))
         return PilotFindings(prior, noise, None, tuple(notes))
     fitted, friction = explained
-    noise = _noise(phasors, experiments, step, fitted.model, _delays(fitted))
+    noise = _noise(phasors, experiments, step, fitted.model, fitted.delay_values)
     for k in friction.seen(FRICTION_SEEN):
         unit = recording.axes[k].torque_unit
         one = friction.torque[k]
@@ -117,7 +117,7 @@ def _explained(
         fitted = _fitted(freed, prior, said)
         if fitted is None:
             break
-        friction = dry_friction(steady, step, band, fitted.model, _delays(fitted))
+        friction = dry_friction(steady, step, band, fitted.model, fitted.delay_values)
         found = fitted, friction
         likely = friction.seen(FRICTION_TAKEN)
         new = np.array([one.value if k in likely else 0.0 for k, one in enumerate(friction.torque)])
@@ -195,7 +195,7 @@ def _fitted(
                 fit_friction=True,
                 delays=delays.tolist(),
             )
-            model, delays = found.model, _delays(found)
+            model, delays = found.model, found.delay_values
     except IdentificationError as error:
         notes.append(
             f"The pilot can not be explained ({error}); the plan rests on the prior model."
@@ -239,7 +239,3 @@ def _trusted(prior: MachineModel) -> dict[str, Estimate]:
                     std = TRUST[kind] * value.value
                     known[f"{axis.name}.{kind}[{k + 1}]"] = Estimate(value.value, std)
     return known
-
-
-def _delays(fitted: RefinedModel) -> FloatArray:
-    return np.array([delay.value for delay in fitted.delays])
