@@ -252,3 +252,19 @@ def _pooled(
         weight + _RESIDUAL_FREEDOM
     )
     return pooled
+
+
+def equation_errors(response: ComplexArray, covariance: ComplexArray) -> ComplexArray:
+    """Return E[e e^H] of e = Theta - G T, shape (..., M, M): what measured phasors leave of noise alone.
+
+    Parameters
+    ----------
+    response
+        G, shape (..., M, M).
+    covariance
+        Of positions, then torques, shape (..., 2M, 2M); leading axes as those of G, or broadcast.
+    """
+    unit = np.broadcast_to(np.eye(response.shape[-1]), response.shape)
+    mixing = np.concatenate([unit, -response], axis=-1)
+    errors: ComplexArray = mixing @ covariance @ mixing.conj().swapaxes(-1, -2)
+    return errors

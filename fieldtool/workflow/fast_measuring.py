@@ -23,6 +23,7 @@ from fieldtool.records.recording import Experiment, Recording, RecordingWriter
 from fieldtool.workflow.models import prior_model
 from fieldtool.workflow.planning import (
     PlannedFast,
+    Timing,
     Wanted,
     freed_of_friction,
     plan_main,
@@ -73,22 +74,23 @@ def plan(
         setting = setting_of(profile, group, prior_model(profile))
         cycle_time = fast_cycle_times(setting.model, group.shortest_cycle)[0]
         times = timing(setting, options.excitation_time or usual_seconds(setting.model))
-        pilot = plan_pilot(setting, cycle_time, times, SEED, group.torque_offsets)
-        main = plan_main(
-            setting,
-            cycle_time,
-            _guessed_noise(group),
-            times,
-            Wanted(),
-            SEED + 1,
-            group.torque_offsets,
-        )
-    planned = replace(main, pilot=pilot)
+        planned, _ = _planned_before(group, setting, cycle_time, times)
     if screen is not None:
         for note in _longer_than_asked(planned, options.excitation_time):
             screen.say(note)
         screen.fast_plan(planned)
     return planned
+
+
+def _planned_before(
+    group: CanopenGroup, setting: Setting, cycle_time: float, times: Timing
+) -> tuple[PlannedFast, MultisinePlan]:
+    """Plan with the prior model, before anything has moved; return it all, and the pilot."""
+    offsets = group.torque_offsets
+    pilot = plan_pilot(setting, cycle_time, times, SEED, offsets)
+    guess = _guessed_noise(group)
+    main = plan_main(setting, cycle_time, guess, times, Wanted(), SEED + 1, offsets)
+    return replace(main, pilot=pilot), pilot
 
 
 def _longer_than_asked(planned: PlannedFast, seconds: float | None) -> tuple[str, ...]:
@@ -188,12 +190,7 @@ class _Measurement:
         """Plan with the prior model, and show it; nothing has moved yet."""
         screen = self._session.screen
         screen.stage("Plan pilot and main experiments with the machine as last accepted")
-        pilot = plan_pilot(self._setting, cycle_time, self._times, SEED, self._offsets)
-        guess = _guessed_noise(self._group)
-        main = plan_main(
-            self._setting, cycle_time, guess, self._times, self._wanted, SEED + 1, self._offsets
-        )
-        planned = replace(main, pilot=pilot)
+        planned, pilot = _planned_before(self._group, self._setting, cycle_time, self._times)
         for note in _longer_than_asked(planned, self._asked):
             self._session.warn(note)
         screen.fast_plan(planned)

@@ -37,7 +37,7 @@ from fieldtool.frf.multisine.sets import (
     experiment_sets,
     inputs_at,
 )
-from fieldtool.frf.phasors import ComplexArray, FloatArray, Phasors
+from fieldtool.frf.phasors import ComplexArray, FloatArray, Phasors, equation_errors
 from fieldtool.frf.response import FrequencyResponse
 from fieldtool.records.recorded import Experiment, Recording
 
@@ -205,12 +205,12 @@ def _solve_line(
     told = inputs_at(there, np.array([line]))[0]
     weights = np.ones(len(there))
     G, A = _weighted(theta, torque, told, weights)
-    errors = _equation_errors(G, noise)
+    errors = equation_errors(G, noise)
     if len(there) > M:
         power = np.einsum("eii->ei", errors).real
         weights = 1 / np.mean(power / power.mean(axis=0), axis=1)
         G, A = _weighted(theta, torque, told, weights)
-        errors = _equation_errors(G, noise)
+        errors = equation_errors(G, noise)
     covariance = np.einsum("eik,ej,el->ijkl", errors, A, A.conj()).reshape(M * M, M * M)
     return G, (covariance + covariance.conj().T) / 2
 
@@ -225,10 +225,3 @@ def _weighted(
     V = root[:, None] * Vh[:M].conj().T
     A = V @ np.linalg.inv(torque @ V)
     return theta @ A, A
-
-
-def _equation_errors(G: ComplexArray, noise: ComplexArray) -> ComplexArray:
-    """Return C_e of each experiment, (E, M, M)."""
-    mixing = np.hstack([np.eye(G.shape[0]), -G])
-    errors: ComplexArray = mixing @ noise @ mixing.conj().T
-    return errors

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fieldtool.errors import NotEnoughDataError
-from fieldtool.frf.phasors import Phasors
+from fieldtool.frf.phasors import Phasors, equation_errors
 from fieldtool.identify.likelihood.whitening import whitening
 
 FloatArray = NDArray[np.float64]
@@ -108,9 +108,6 @@ def joint_spectra(phasors: Sequence[Phasors], response: ComplexArray) -> JointSp
     omega = frequencies_of(phasors)
     lines = 2 * np.pi * np.concatenate([p.frequencies for p in phasors])
     place = np.searchsorted(omega, lines * (1 + SAME), side="right") - 1
-    mixing = np.concatenate(
-        [np.broadcast_to(np.eye(len(phasors[0].axes)), response.shape), -response], axis=2
-    )[place]
     errors = np.concatenate([p.covariance for p in phasors])
     return JointSpectra(
         phasors[0].axes,
@@ -118,5 +115,5 @@ def joint_spectra(phasors: Sequence[Phasors], response: ComplexArray) -> JointSp
         place,
         np.concatenate([p.position for p in phasors]),
         np.concatenate([p.torque for p in phasors]),
-        mixing @ errors @ mixing.conj().transpose(0, 2, 1),
+        equation_errors(response[place], errors),
     )

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.optimize import nnls
 
 from fieldtool.errors import IdentificationError, NotEnoughDataError
-from fieldtool.frf.phasors import Phasors
+from fieldtool.frf.phasors import Phasors, equation_errors
 from fieldtool.identify.chains.forward import spectra
 from fieldtool.identify.likelihood.expected import Noise
 from fieldtool.identify.likelihood.joint_data import frequencies_of, joint_spectra
@@ -164,8 +164,7 @@ def _noise(
         samples = round(float(experiment.period or 0.0) / sample_period)
         counted = experiment.samples // samples * samples
         response = machine_response(model, 2 * np.pi * one.frequencies, delays)
-        mixing = np.concatenate([np.broadcast_to(np.eye(axes), response.shape), -response], axis=2)
-        error = np.einsum("fia,fab,fib->fi", mixing, one.covariance, mixing.conj()).real
+        error = np.einsum("fkk->fk", equation_errors(response, one.covariance)).real
         passed = np.concatenate(
             [np.abs(response) ** 2, np.broadcast_to(np.eye(axes), response.shape)], axis=2
         )
