@@ -128,7 +128,7 @@ def test_a_disk_that_is_full_leaves_what_was_there(tmp_path, monkeypatch):
     def full(_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("drives.parameters.os.fsync", full)
+    monkeypatch.setattr("drives.parameters.backup.os.fsync", full)
     with pytest.raises(OSError, match="No space"):
         save_backup(backup_of(HeldObject(info("UNSIGNED8"), 2)), path)
     assert path.read_bytes() == before

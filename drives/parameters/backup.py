@@ -1,0 +1,209 @@
+"""Back up every writable parameter of every drive to a file, and read such a file."""
+
+import hashlib
+import json
+import os
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from drives.canopen_drive import CanopenDrive
+from drives.errors import ProfileError, SdoAbortError
+from drives.objects import DATA_TYPES, ObjectAddress, ObjectInfo
+from drives.parameters.values import HeldObject
+from drives.profile import read_yaml
+
+FORMAT = "fieldtool-parameters/1"
+MAX_BACKUP_BYTES = 30_000_000
+"""A drive has some thousand objects of 100 bytes here; a machine at most 32 drives."""
+_DUMPER: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
+
+
+@dataclass(frozen=True)
+class DriveBackup:
+    """Every writable parameter of one drive, and who the drive is."""
+
+    axis: str
+    node_id: int
+    vendor_id: int
+    product_code: int
+    serial_number: int
+    held: tuple[HeldObject, ...]
+
+
+@dataclass(frozen=True)
+class Backup:
+    """Every writable parameter of all drives of a machine."""
+
+    machine: str
+    taken: str
+    """UTC, ISO 8601."""
+    drives: tuple[DriveBackup, ...]
+
+
+def back_up(machine: str, drives: Iterable[CanopenDrive]) -> Backup:
+    """Read every writable parameter of every drive.
+
+    Left out are write-only objects, and those whose value could not be written again: numbers that
+    are not finite, text that is no ASCII.
+    """
+    parts = []
+    for drive in drives:
+        held = []
+        for info in drive.writable_parameters():
+            try:
+                one = HeldObject(info, drive.read(info))
+            except SdoAbortError as error:
+                if error.code not in (0x06010001, 0x06020000, 0x06090011):
+                    raise
+                continue
+            if _can_be_written(one):
+                held.append(one)
+        identity = drive.identity
+        parts.append(
+            DriveBackup(
+                drive.axis,
+                drive.node_id,
+                identity.vendor_id,
+                identity.product_code,
+                identity.serial_number,
+                tuple(held),
+            )
+        )
+    return Backup(machine, datetime.now(UTC).isoformat(timespec="seconds"), tuple(parts))
+
+
+def _can_be_written(held: HeldObject) -> bool:
+    try:
+        held.info.encode(held.value)
+    except ValueError:
+        return False
+    return True
+
+
+def save_backup(backup: Backup, path: Path) -> None:
+    """Write a backup to a YAML file, and see that it is read back the same.
+
+    Raises
+    ------
+    OSError
+        If the file can not be written; what was there before is unchanged.
+    ProfileError
+        If what was written is not read back the same.
+    """
+    parts = [_drive_as_dict(d) for d in backup.drives]
+    data = {
+        "format": FORMAT,
+        "machine": backup.machine,
+        "taken": backup.taken,
+        "checksum": _checksum(parts),
+        "drives": parts,
+    }
+    temporary = path.with_name(path.name + ".part")
+    try:
+        with temporary.open("w", encoding="utf-8") as file:
+            yaml.dump(data, file, Dumper=_DUMPER, sort_keys=False, width=120)
+            file.flush()
+            os.fsync(file.fileno())
+        if load_backup(temporary) != backup:
+            raise ProfileError(path, "the backup is not read back as it was written")
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _drive_as_dict(drive: DriveBackup) -> dict[str, Any]:
+    return {
+        "axis": drive.axis,
+        "node_id": drive.node_id,
+        "vendor_id": drive.vendor_id,
+        "product_code": drive.product_code,
+        "serial_number": drive.serial_number,
+        "objects": [
+            {
+                "object": str(held.info.address),
+                "name": held.info.name,
+                "type": held.info.type,
+                "value": held.value,
+            }
+            for held in drive.held
+        ],
+    }
+
+
+def _checksum(parts: Any) -> str:
+    """Return the SHA-256 of the drives' part of a backup, in one spelling of its values."""
+    text = json.dumps(parts, sort_keys=True, default=str)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def load_backup(path: Path) -> Backup:
+    """Read a backup file.
+
+    Raises
+    ------
+    ProfileError
+        If the file is no backup, or not whole: with file and line.
+    """
+    data, lines = read_yaml(path, MAX_BACKUP_BYTES)
+    if data.get("format") != FORMAT:
+        raise ProfileError(path, f"format must be {FORMAT}, got {data.get('format')!r}", 1)
+    place: list[str | int] = []
+    try:
+        backup = Backup(
+            str(data["machine"]),
+            str(data["taken"]),
+            tuple(
+                _drive_backup(drive, k, place) for k, drive in enumerate(_listed(data["drives"]))
+            ),
+        )
+    except (KeyError, TypeError, AttributeError, ValueError, ArithmeticError) as error:
+        what = f"key {error} is missing" if isinstance(error, KeyError) else str(error)
+        line = lines.get(tuple(place), 1)
+        raise ProfileError(path, f"is no parameter backup: {what}", line) from None
+    if data.get("checksum") != _checksum(data["drives"]):
+        raise ProfileError(
+            path,
+            "is not whole: its checksum does not fit what stands in it. It was cut short or changed; "
+            "use another copy",
+            lines.get(("checksum",), 1),
+        )
+    return backup
+
+
+def _listed(value: Any) -> list[Any]:
+    if not isinstance(value, list):
+        raise TypeError(f"a list was expected, got {value!r}")
+    return value
+
+
+def _drive_backup(drive: Mapping[str, Any], k: int, place: list[str | int]) -> DriveBackup:
+    place[:] = ["drives", k]
+    held: dict[ObjectAddress, HeldObject] = {}
+    for j, item in enumerate(_listed(drive["objects"])):
+        place[:] = ["drives", k, "objects", j]
+        one = _held(item)
+        if one.info.address in held:
+            raise ValueError(f"object {one.info.address} stands here a second time")
+        held[one.info.address] = one
+    place[:] = ["drives", k]
+    return DriveBackup(
+        str(drive["axis"]),
+        int(drive["node_id"]),
+        int(drive["vendor_id"]),
+        int(drive["product_code"]),
+        int(drive["serial_number"]),
+        tuple(held.values()),
+    )
+
+
+def _held(item: Mapping[str, Any]) -> HeldObject:
+    if item["type"] not in DATA_TYPES:
+        raise ValueError(f"unknown type {item['type']!r}")
+    info = ObjectInfo(ObjectAddress.parse(item["object"]), item["type"], str(item["name"]))
+    info.encode(item["value"])
+    return HeldObject(info, item["value"])
