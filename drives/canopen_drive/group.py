@@ -4,6 +4,7 @@ import sys
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import cached_property
+from pathlib import Path
 
 import can
 
@@ -18,6 +19,7 @@ from drives.cia402 import Mode
 from drives.errors import DrivesError, LimitsError, NothingMovedError, NotSupportedError
 from drives.objects import ObjectInfo
 from drives.profile import DriveProfile, MachineProfile, load_drive
+from drives.trace import traced
 
 START_NODE, ENTER_PRE_OPERATIONAL = 0x01, 0x80
 LISTENING_TIME = 0.3
@@ -252,6 +254,7 @@ def connect(
     machine: MachineProfile,
     bus: can.BusABC | None = None,
     stop_requested: Callable[[], bool] = _never,
+    trace: Path | None = None,
 ) -> Iterator[CanopenGroup]:
     """Open the machine's bus, and identify every drive on it; nothing moves and nothing is written.
 
@@ -263,11 +266,13 @@ def connect(
         A bus that is open already, and stays open; else the profile's is opened and closed.
     stop_requested
         Asked in every cycle of a motion: whether the user wants to stop.
+    trace
+        File that every frame is noted in (``drives.trace``); none where it is None.
 
     Raises
     ------
     BusError
-        If the bus can not be opened.
+        If the bus can not be opened, or the trace can not be written.
     NothingMovedError
         If a node is absent, another device, in fault, has no scales, or a limit does not fit them.
     """
@@ -280,9 +285,12 @@ def connect(
             )
         if axis.drive not in profiles:
             profiles[axis.drive] = load_drive(axis.drive, machine.path)
-    own = open_bus(machine.bus) if bus is None else None
-    line = Line(bus if own is None else own)  # type: ignore[arg-type]
-    try:
+    with ExitStack() as stack:
+        if bus is None:
+            bus = open_bus(machine.bus)
+            stack.callback(bus.shutdown)
+        line = Line(stack.enter_context(traced(bus, trace)))
+        stack.callback(_forget_nodes, line)
         drives = [CanopenDrive(line, axis, profiles[axis.drive]) for axis in machine.axes]
         for drive in drives:
             drive.identify()
@@ -292,11 +300,11 @@ def connect(
             drive.read_scaling()
             drive.check_limits()
         yield CanopenGroup(line, machine, drives, stop_requested)
-    finally:
-        for node_id in list(line.nodes):
-            del line[node_id]
-        if own is not None:
-            own.shutdown()
+
+
+def _forget_nodes(line: Line) -> None:
+    for node_id in list(line.nodes):
+        del line[node_id]
 
 
 def _check_alone(line: Line, drives: Sequence[CanopenDrive]) -> None:

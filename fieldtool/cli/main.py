@@ -42,6 +42,7 @@ from fieldtool.cli.screen import (
     show_parameters,
     show_result,
 )
+from fieldtool.cli.tracing import TraceFile, TraceWanted, trace_path
 from fieldtool.errors import (
     FieldtoolError,
     FileFormatError,
@@ -182,7 +183,12 @@ def _folder(out: Path | None, name: str) -> Path:
 
 
 def _options(
-    plan: str, write: bool, store: bool, motor: str, seconds: float | None = None
+    plan: str,
+    write: bool,
+    store: bool,
+    motor: str,
+    seconds: float | None = None,
+    trace: Path | None = None,
 ) -> workflow.Options:
     if plan not in ("classic", "fast"):
         raise typer.BadParameter(f"no plan is called {plan!r}; there are: fast, classic")
@@ -198,6 +204,7 @@ def _options(
         write=write,
         store=store,
         motor_inertia="measured" if motor == "measured" else "data sheet",
+        trace=trace,
     )
 
 
@@ -244,11 +251,15 @@ def run(
     motor_inertia: Motor = "measured",
     seconds: Seconds = None,
     plan_only: PlanOnly = False,
+    trace: TraceWanted = False,
+    trace_file: TraceFile = None,
     out: Out = None,
     as_json: Json = False,
 ) -> None:
     """MOVES THE MACHINE. Measure, identify, design and, with --write, write back."""
-    options = _options(plan, write, store, motor_inertia, seconds)
+    folder = _folder(out, machine)
+    traced = trace_path(trace, trace_file, folder)
+    options = _options(plan, write, store, motor_inertia, seconds, traced)
     console = _console(as_json)
     if plan_only:
         _show_plan(machine, options, console, as_json)
@@ -256,7 +267,7 @@ def run(
     with _stop_key() as key, TerminalScreen(console, _may_move(yes)) as screen:
         result = workflow.run(
             machine,
-            _folder(out, machine),
+            folder,
             options,
             screen=_StoppableScreen(screen, key),
             confirm=_asker(console, yes, key, store),
@@ -278,11 +289,25 @@ def demo(
         str, typer.Option("--machine", help="Another packaged simulated machine.")
     ] = "paper-3x3",
     seconds: Seconds = None,
+    trace: TraceWanted = False,
+    trace_file: TraceFile = None,
     out: Out = None,
     as_json: Json = False,
 ) -> None:
     """Do the whole job on the packaged simulated machine: no hardware, no arguments."""
-    run(machine, plan, write, True, store, "measured", seconds, False, out, as_json)
+    run(
+        machine,
+        plan,
+        write,
+        yes=True,
+        store=store,
+        motor_inertia="measured",
+        seconds=seconds,
+        trace=trace,
+        trace_file=trace_file,
+        out=out,
+        as_json=as_json,
+    )
 
 
 @app.command()
@@ -292,16 +317,19 @@ def measure(
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask before moving.")] = False,
     seconds: Seconds = None,
     plan_only: PlanOnly = False,
+    trace: TraceWanted = False,
+    trace_file: TraceFile = None,
     out: Out = None,
     as_json: Json = False,
 ) -> None:
     """MOVES THE MACHINE. Measure only; the recording is in the session folder."""
-    options = _options(plan, False, False, "measured", seconds)
+    folder = _folder(out, machine)
+    traced = trace_path(trace, trace_file, folder)
+    options = _options(plan, False, False, "measured", seconds, traced)
     console = _console(as_json)
     if plan_only:
         _show_plan(machine, options, console, as_json)
         return
-    folder = _folder(out, machine)
     with _stop_key() as key, TerminalScreen(console, _may_move(yes)) as screen:
         seconds = workflow.measure(
             machine, folder, options, screen=_StoppableScreen(screen, key), stop_requested=key
@@ -419,10 +447,13 @@ def write(
     folder: Annotated[Path, typer.Argument(help="Session folder with a tuning.")],
     yes: Yes = False,
     store: Store = False,
+    trace: TraceWanted = False,
+    trace_file: TraceFile = None,
 ) -> None:
     """Write the session folder's tuning into the drives: backup, write, read back."""
     console = _console(False)
-    options = workflow.Options(write=True, store=store)
+    traced = trace_path(trace, trace_file, folder)
+    options = workflow.Options(write=True, store=store, trace=traced)
     with _stop_key() as key, TerminalScreen(console) as screen:
         stoppable = _StoppableScreen(screen, key)
         result = workflow.write(folder, options, _asker(console, yes, key, store), screen=stoppable)
@@ -438,13 +469,16 @@ def restore(
     store: Annotated[
         bool, typer.Option("--store", help="Store the restored parameters too.")
     ] = False,
+    trace: TraceWanted = False,
+    trace_file: TraceFile = None,
 ) -> None:
     """Bring a backup of the drives' parameters back."""
+    folder = backup if backup.is_dir() else backup.parent
     if machine is None:
-        folder = backup if backup.is_dir() else backup.parent
         machine = str(folder / "machine.yaml")
+    traced = trace_path(trace, trace_file, folder)
     with _stop_key():
-        written = workflow.restore(machine, backup, store)
+        written = workflow.restore(machine, backup, store, traced)
     console = _console(False)
     console.print(f"{len(written)} parameters differed and were restored; all were read back.")
     console.print(

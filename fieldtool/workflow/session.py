@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal, Protocol
@@ -13,6 +13,7 @@ from drives.bus import not_imitated
 from drives.canopen_drive import CanopenGroup, connect
 from drives.parameters import Change, Written
 from drives.profile import MachineProfile, load_machine
+from drives.trace import trace_problem
 from fieldtool.design.tuning import Tuning
 from fieldtool.errors import OutputError
 from fieldtool.experiment.forecast import AxisForecast
@@ -96,6 +97,12 @@ class Options:
     write: bool = False
     store: bool = False
     motor_inertia: Literal["measured", "data sheet"] = "measured"
+    trace: Path | None = None
+    """File that every frame of the session is noted in; none where it is None."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values, as a session's log keeps them."""
+        return {**asdict(self), "trace": self.trace.name if self.trace else None}
 
 
 @dataclass(frozen=True)
@@ -160,6 +167,8 @@ def open_session(
     screen: Screen | None,
     stop_requested: Callable[[], bool],
     keep_profile: bool = False,
+    command: str = "",
+    options: Options | None = None,
 ) -> Iterator[tuple[Session, CanopenGroup]]:
     """Make the session folder, connect to the machine, and note how it ended.
 
@@ -175,7 +184,10 @@ def open_session(
         Asked in every cycle of a motion.
     keep_profile
         Leave the folder's machine profile as it is.
+    command, options
+        What is done, for the session's log; with the file that every frame is noted in.
     """
+    options = options or Options()
     profile = machine if isinstance(machine, MachineProfile) else load_machine(machine)
     folder = SessionFolder.create(out)
     if not keep_profile:
@@ -186,10 +198,16 @@ def open_session(
             )
         write_yaml(folder.machine, _resolved(profile))
     session = Session(folder, profile, screen or Quiet())
-    folder.note("session", machine=profile.name, version=version("fieldtool"))
+    folder.note(
+        "session",
+        machine=profile.name,
+        version=version("fieldtool"),
+        command=command,
+        options=options.as_dict(),
+    )
     session.screen.stage(f"Connect to {profile.name}")
     try:
-        with connect(profile, stop_requested=stop_requested) as group:
+        with connect(profile, stop_requested=stop_requested, trace=options.trace) as group:
             for drive in group.drives:
                 identity = drive.identity
                 folder.note("drive", axis=drive.axis, node=drive.node_id, name=identity.device_name)
@@ -201,8 +219,9 @@ def open_session(
                     + "."
                 )
             yield session, group
-            for text in group.warnings:
-                session.warn(text)
+            for text in (*group.warnings, trace_problem(group.line.can_bus)):
+                if text:
+                    session.warn(text)
     except BaseException as error:
         folder.note("ended", error=type(error).__name__, text=str(error))
         raise

@@ -80,7 +80,10 @@ def run(
     """
     options = options or Options()
     begin = time.perf_counter()
-    with open_session(machine, out, screen, stop_requested) as (session, group):
+    with open_session(machine, out, screen, stop_requested, command="run", options=options) as (
+        session,
+        group,
+    ):
         machine_time = _measured(session, group, options)
         if group.late_cycles:
             session.warn(
@@ -125,8 +128,12 @@ def measure(
     DrivesError, FieldtoolError
         As :func:`run`.
     """
-    with open_session(machine, out, screen, stop_requested) as (session, group):
-        return _measured(session, group, options or Options())
+    options = options or Options()
+    with open_session(machine, out, screen, stop_requested, command="measure", options=options) as (
+        session,
+        group,
+    ):
+        return _measured(session, group, options)
 
 
 def identify(
@@ -210,14 +217,19 @@ def write(
     """
     folder = SessionFolder(folder_path)
     tuning = read_tuning(folder.tuning)
-    with open_session(folder.machine, folder_path, screen, never, keep_profile=True) as (s, group):
+    with open_session(folder.machine, folder_path, screen, never, True, "write", options) as (
+        s,
+        group,
+    ):
         result = _write(s, group, tuning, options, confirm)
         if result is None:
             raise FileFormatError(folder.tuning, "writing was not asked for")
         return result
 
 
-def restore(machine: str | Path, backup: Path, store: bool = False) -> tuple[HeldObject, ...]:
+def restore(
+    machine: str | Path, backup: Path, store: bool = False, trace: Path | None = None
+) -> tuple[HeldObject, ...]:
     """Bring a backup back into a machine's drives; return what had to be written.
 
     Raises
@@ -227,7 +239,7 @@ def restore(machine: str | Path, backup: Path, store: bool = False) -> tuple[Hel
     """
     path = backup / "parameters-before.yaml" if backup.is_dir() else backup
     load_backup(path)
-    with connect(load_machine(machine)) as group:
+    with connect(load_machine(machine), trace=trace) as group:
         return undo(group.drives, path, store)
 
 
