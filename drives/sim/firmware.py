@@ -6,8 +6,7 @@ goes stands in :mod:`drives.sim.servo_kernel`.  This module is the side that a C
 parameters, what to follow, what can be read.
 
 What it does not imitate: the time that the loop needs to compute, the power stage's ripple and
-saturation of its voltage, temperature, an encoder with errors other than its resolution, and a
-velocity limit in torque mode.
+saturation of its voltage, temperature, and a velocity limit in torque mode.
 
 Rotary axes are in rad and N m, linear axes in m and N; docstrings say rad and N m for both.
 """
@@ -15,6 +14,7 @@ Rotary axes are in rad and N m, linear axes in m and N; docstrings say rad and N
 from collections.abc import Sequence
 from dataclasses import astuple
 from math import exp, isfinite, isnan, pi
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,9 @@ from numpy.typing import NDArray
 from drives.errors import DrivesError
 from drives.sim import servo_kernel
 from drives.sim.biquad import FilterType, biquad
+from drives.sim.element_kernel import Elements, Shafts, late_counts, seen
+from drives.sim.forced_kernel import advance_forced
+from drives.sim.imperfect import element_tables, has_servo_effect, pushed_masses, shaft_tables
 from drives.sim.plant import Plant, PlantParameters
 from drives.sim.servo_kernel import Derived, Outcome, Parameter, Reference, Signal
 from drives.sim.servo_settings import DriveHardware, ParameterRange, factory_values, ranges
@@ -47,6 +50,14 @@ _FILTERS = (
     (Parameter.FILTER2_TYPE, Derived.FILTER2),
 )
 """First of the four parameters, first of the five coefficients."""
+
+
+class _Imperfect(NamedTuple):
+    """What acts beside chains, dry friction and ideal shafts."""
+
+    elements: Elements
+    shafts: Shafts
+    forces: FloatArray
 
 
 class SimulationDivergedError(DrivesError):
@@ -112,8 +123,17 @@ class SimulatedAxes:
         self._increments = np.ascontiguousarray(np.hstack([increment, forced[:, self._motors]]).T)
         self._state = np.zeros(2 * self.plant.size)
         self._stick_slip: StickSlip | None = None
-        if self.plant.breakaway.any():
-            self._stick_slip = StickSlip(self.plant, self._step)
+        self._imperfect: _Imperfect | None = None
+        elements = self.plant.elements(self._step)
+        parts = [chain.effects for chain in plant_parameters.chains]
+        if elements or self.plant.brakes.any() or any(has_servo_effect(own) for own in parts):
+            self._imperfect = _Imperfect(
+                element_tables(elements),
+                shaft_tables(parts, self._step),
+                np.zeros(len(pushed_masses(elements))),
+            )
+        if self.plant.breakaway.any() or self._imperfect is not None:
+            self._stick_slip = StickSlip(self.plant, self._step, pushed_masses(elements))
         axes = len(self.hardware)
         self._signals = np.zeros((axes, Signal.COLUMNS))
         self._settings = np.zeros((axes, Derived.COLUMNS))
@@ -164,17 +184,35 @@ class SimulatedAxes:
             )
 
     def _advance_holding(self, steps: int, stick_slip: StickSlip) -> bool:
-        """With dry friction; tables that turn out to be missing are made on the way."""
+        """With dry friction or other effects; tables that turn out to be missing are made on the way."""
+        parts = self._imperfect
         while True:
-            outcome = servo_kernel.advance_holding(
-                steps,
-                self._step,
-                self._state,
-                self._signals,
-                self._settings,
-                self._motors,
-                stick_slip.tables,
-            )
+            if parts is None:
+                outcome = servo_kernel.advance_holding(
+                    steps,
+                    self._step,
+                    self._state,
+                    self._signals,
+                    self._settings,
+                    self._motors,
+                    stick_slip.tables,
+                )
+            else:
+                outcome = advance_forced(
+                    steps,
+                    self._steps,
+                    self._step,
+                    self._state,
+                    self._signals,
+                    self._settings,
+                    self._motors,
+                    stick_slip.tables,
+                    parts.elements,
+                    parts.shafts,
+                    stick_slip.brakes,
+                    stick_slip.brake_limits,
+                    parts.forces,
+                )
             if outcome != Outcome.NEEDS_SET:
                 return bool(outcome == Outcome.DONE)
             stick_slip.add_set()
@@ -219,7 +257,11 @@ class SimulatedAxes:
         for axis, row in enumerate(self._rows):
             scale = self.hardware[axis].counts_per_unit
             motor = int(self._motors[axis])
-            row[Signal.COUNTS] = np.floor(state[motor] * scale)
+            position = float(state[motor])
+            if self._imperfect is not None:
+                position = seen(axis, position, self._imperfect.shafts)
+                self._imperfect.shafts.queue[axis] = np.floor(position * scale)
+            row[Signal.COUNTS] = np.floor(position * scale)
             row[Signal.POSITION] = row[Signal.COUNTS] / scale
             row[Signal.VELOCITY] = state[self.plant.size + motor]
             row[Signal.SLOW_STEPS] = 0.0
@@ -419,6 +461,8 @@ class SimulatedAxes:
         valid until the next call.
         """
         servo_kernel.latch(self._signals, self._settings, self._draw(), *self._out)
+        if self._imperfect is not None:
+            late_counts(self._imperfect.shafts, self._out[0])
         return self._out
 
     def reference_position(self, axis: int) -> float:

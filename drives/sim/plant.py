@@ -7,11 +7,14 @@ Motor i pushes the first mass of chain i; inertia couplings join last masses::
 
     M q'' + C q' + K q = f
 
-Masses are numbered chain after chain, motor side first.  SI units: kg, N/m, N s/m, N, m on linear
+Masses are numbered chain after chain, motor side first, and then those that hang on chains beside
+them (extra modes).  SI units: kg, N/m, N s/m, N, m on linear
 axes; kg m2, N m/rad, N m s/rad, N m, rad on rotary ones.  A state is (q, q'), shape (2n,).
 
 Valid for: any number of chains of any length, N = 1 being a rigid axis.  Nothing holds the machine
-to the ground, so there are as many rigid-body modes as chains.
+to the ground, so there are as many rigid-body modes as chains (less where springs join chains).
+
+What a part with a bend or a memory pulls is not in the matrices: :meth:`Plant.elements` lists it.
 
 Dry friction holds single masses still; matrices, response and steps here are those of the machine
 between its events, with no mass or some masses held (:mod:`drives.sim.stick_slip` says when).
@@ -24,8 +27,23 @@ from math import isfinite
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import expm
+from scipy.sparse.csgraph import connected_components
 
-from drives.sim.effects import ChainEffect, FloatArray, LinearEffect, ViscousFriction
+from drives.sim.effects import (
+    BentEffect,
+    ChainEffect,
+    CoulombFriction,
+    CouplingInertia,
+    CouplingSpring,
+    Element,
+    ExtraMode,
+    FloatArray,
+    Gravity,
+    LinearEffect,
+    MachineEffect,
+    Site,
+    ViscousFriction,
+)
 
 ComplexArray = NDArray[np.complex128]
 
@@ -88,6 +106,8 @@ class PlantParameters:
     chains: tuple[ChainParameters, ...]
     couplings: tuple[tuple[int, int, float], ...] = ()
     """(a, b, m_ab): mass-matrix entry between the last masses of chains a and b, kg or kg m2."""
+    effects: tuple[MachineEffect, ...] = ()
+    """What else joins chains."""
 
     def __post_init__(self) -> None:
         if not self.chains:
@@ -108,6 +128,12 @@ class PlantParameters:
                     f"coupling ({a}, {b}) is {value} kg or kg m2; it must stay below "
                     f"{(last_a * last_b) ** 0.5:.6g}, the geometric mean of the two last masses, "
                     "or the mass matrix is not positive definite"
+                )
+        for effect in self.effects:
+            if max(effect.chains) >= len(self.chains):
+                raise ValueError(
+                    f"{type(effect).__name__}: chains {effect.chains} are not two of the "
+                    f"{len(self.chains)} chains; count from 0"
                 )
         smallest = float(np.linalg.eigvalsh(_mass_matrix(self))[0])
         if smallest <= 0.0:
@@ -132,7 +158,7 @@ class Plant:
         counts = [len(chain.masses) for chain in parameters.chains]
         self.motors: NDArray[np.intp] = _first_masses(parameters)
         """Number of each chain's first mass, shape (M,)."""
-        self.size = sum(counts)
+        self.size = sum(counts) + len(_hanging(parameters))
         """n, the number of all masses."""
         self.effects: tuple[LinearEffect, ...] = tuple(
             ViscousFriction(int(motor), chain.viscous_friction)
@@ -141,29 +167,49 @@ class Plant:
         )
         self.mass_matrix: FloatArray = _mass_matrix(parameters)
         """M, shape (n, n)."""
-        self.stiffness_matrix: FloatArray = _between_neighbours(
-            counts, [chain.springs for chain in parameters.chains]
+        links = _links(parameters)
+        self.stiffness_matrix: FloatArray = _between(
+            self.size, [(a, b, spring) for a, b, spring, _ in links]
         )
-        """K, shape (n, n), singular: every chain can turn as a whole."""
+        """K, shape (n, n), singular: the machine can turn as a whole."""
         self.damping_matrix: FloatArray = sum(
             (effect.damping(self.size) for effect in self.effects),
-            start=_between_neighbours(counts, [chain.dampers for chain in parameters.chains]),
+            start=_between(self.size, [(a, b, damper) for a, b, _, damper in links]),
         )
         """C, shape (n, n)."""
         self.breakaway: FloatArray = _breakaway(parameters)
         """Dry friction on each mass, N m (or N), shape (n,); 0 where there is none."""
+        self.brakes: FloatArray = _brakes(parameters)
+        """Torque of each motor's brake while its power stage is off, N m (or N), shape (M,)."""
 
     @property
     def eigenfrequencies(self) -> FloatArray:
         """Undamped angular frequencies, rad/s, rising, shape (n,); the rigid-body modes are 0.
 
-        Their number is the number of chains by construction, so they are set to 0 exactly.
+        Their number is known by construction (what no spring joins), so they are set to 0 exactly.
         """
         factor = np.linalg.cholesky(self.mass_matrix)
         half = np.linalg.solve(factor, self.stiffness_matrix)
         eigenvalues = np.linalg.eigvalsh(np.linalg.solve(factor, half.T))
-        eigenvalues[: self.motors.size] = 0.0
+        eigenvalues[: connected_components(self.stiffness_matrix != 0.0)[0]] = 0.0
         return np.sqrt(eigenvalues)
+
+    def elements(self, step: float) -> tuple[Element, ...]:
+        """Forces with a bend or a memory, made for inner steps of this length, s.
+
+        Raises
+        ------
+        ValueError
+            If a part sits at a joint that its chain does not have.
+        """
+        found: list[Element] = []
+        for first, chain in zip(self.motors.tolist(), self.parameters.chains, strict=True):
+            site = Site(first, chain.masses, chain.springs, chain.dampers, step)
+            for effect in chain.effects:
+                if hasattr(effect, "elements"):
+                    bent: BentEffect = effect
+                    found += bent.elements(site)
+        return tuple(found)
 
     def response(self, omega: ArrayLike) -> ComplexArray:
         """Motor positions per motor torque of the continuous plant, without dry friction.
@@ -267,30 +313,77 @@ def _first_masses(parameters: PlantParameters) -> NDArray[np.intp]:
 
 
 def _breakaway(parameters: PlantParameters) -> FloatArray:
-    torques = np.zeros(sum(len(chain.masses) for chain in parameters.chains))
-    first = 0
-    for chain in parameters.chains:
-        last = first + len(chain.masses) - 1
+    torques = np.zeros(sum(len(c.masses) for c in parameters.chains) + len(_hanging(parameters)))
+    for first, chain in zip(_first_masses(parameters), parameters.chains, strict=True):
         for effect in chain.effects:
-            torques[first if effect.location == "motor" else last] += effect.torque
-        first = last + 1
+            if isinstance(effect, CoulombFriction):
+                place = first if effect.location == "motor" else first + len(chain.masses) - 1
+                torques[place] += effect.torque
     return torques
 
 
+def _brakes(parameters: PlantParameters) -> FloatArray:
+    torques = np.zeros(len(parameters.chains))
+    for axis, chain in enumerate(parameters.chains):
+        for effect in chain.effects:
+            if isinstance(effect, Gravity):
+                torques[axis] = max(torques[axis], effect.brake_torque)
+    return torques
+
+
+def _hanging(parameters: PlantParameters) -> list[tuple[int, ExtraMode]]:
+    """What hangs on chains: the number of the mass that it hangs on, and the part."""
+    found = []
+    for first, chain in zip(_first_masses(parameters), parameters.chains, strict=True):
+        for effect in chain.effects:
+            if isinstance(effect, ExtraMode):
+                last = first + len(chain.masses) - 1
+                found.append((int(first if effect.location == "motor" else last), effect))
+    return found
+
+
+def _end(parameters: PlantParameters, chain: int, location: str) -> int:
+    first = int(_first_masses(parameters)[chain])
+    return first if location == "motor" else first + len(parameters.chains[chain].masses) - 1
+
+
+def _links(parameters: PlantParameters) -> list[tuple[int, int, float, float]]:
+    """(mass, mass, spring, damper) of all springs."""
+    links = []
+    for first, chain in zip(_first_masses(parameters).tolist(), parameters.chains, strict=True):
+        for k, (spring, damper) in enumerate(zip(chain.springs, chain.dampers, strict=True)):
+            links.append((first + k, first + k + 1, spring, damper))
+    number = sum(len(chain.masses) for chain in parameters.chains)
+    for k, (mass, mode) in enumerate(_hanging(parameters), start=number):
+        links.append((mass, k, mode.spring, mode.damper))
+    for effect in parameters.effects:
+        if isinstance(effect, CouplingSpring):
+            a, b = (_end(parameters, chain, effect.location) for chain in effect.chains)
+            links.append((a, b, effect.spring, effect.damper))
+    return links
+
+
 def _mass_matrix(parameters: PlantParameters) -> FloatArray:
-    matrix = np.diag([m for chain in parameters.chains for m in chain.masses]).astype(np.float64)
-    last = np.cumsum([len(chain.masses) for chain in parameters.chains]) - 1
-    for a, b, value in parameters.couplings:
-        matrix[last[a], last[b]] = matrix[last[b], last[a]] = value
+    masses = [m for chain in parameters.chains for m in chain.masses]
+    masses += [mode.inertia for _, mode in _hanging(parameters)]
+    matrix = np.diag(masses).astype(np.float64)
+    entries = [(a, b, value, "load") for a, b, value in parameters.couplings]
+    entries += [
+        (*effect.chains, effect.inertia, effect.location)
+        for effect in parameters.effects
+        if isinstance(effect, CouplingInertia)
+    ]
+    for a, b, value, location in entries:
+        row, column = _end(parameters, a, location), _end(parameters, b, location)
+        matrix[row, column] += value
+        matrix[column, row] += value
     return matrix
 
 
-def _between_neighbours(counts: Sequence[int], elements: Sequence[tuple[float, ...]]) -> FloatArray:
-    """Stiffness-like matrix of elements that join neighbours in each chain."""
-    matrix = np.zeros((sum(counts), sum(counts)))
-    first = 0
-    for count, chain in zip(counts, elements, strict=True):
-        for k, element in enumerate(chain, start=first):
-            matrix[k : k + 2, k : k + 2] += element * np.array([[1.0, -1.0], [-1.0, 1.0]])
-        first += count
+def _between(size: int, elements: Sequence[tuple[int, int, float]]) -> FloatArray:
+    """Stiffness-like matrix of elements that join two masses each."""
+    matrix = np.zeros((size, size))
+    for a, b, element in elements:
+        pair = np.array([a, b])
+        matrix[np.ix_(pair, pair)] += element * np.array([[1.0, -1.0], [-1.0, 1.0]])
     return matrix

@@ -214,7 +214,8 @@ class Outcome(IntEnum):
 class Holding(NamedTuple):
     """Dry friction of a plant: F masses that can stick, S sets of standing masses tabulated so far.
 
-    C = 2n + M + F columns stand for state, motor torques and friction torques.
+    C = 2n + M + F columns stand for state, motor torques and friction torques; more may follow, for
+    forces on further masses.
     """
 
     masses: IntArray

@@ -28,6 +28,8 @@ Matrices belong to a set of standing masses.  They are made when that set first 
 made anew when they would need more than 64 MB.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from drives.sim.effects import FloatArray
@@ -36,6 +38,8 @@ from drives.sim.servo_kernel import LEVELS, TICKS, BoolArray, Holding, Progress
 
 _LARGEST_TABLES = 64_000_000
 """Bytes."""
+_RELEASED = 1e-12
+"""Friction of an open brake, of its torque when closed: a mass without any could not stand or slide."""
 
 
 class StickSlip:
@@ -44,28 +48,45 @@ class StickSlip:
     Parameters
     ----------
     plant
-        With friction on at least one mass (``plant.breakaway``).
+        With friction (``plant.breakaway``) or brakes on some masses, or none.
     step
         Inner step, s.
+    forced
+        Numbers of further masses on which forces act that are held over the inner step.
     """
 
-    def __init__(self, plant: Plant, step: float) -> None:
+    def __init__(self, plant: Plant, step: float, forced: Sequence[int] = ()) -> None:
         self._plant, self._step = plant, step
-        self._masses = np.flatnonzero(plant.breakaway > 0.0)
-        count, axes = self._masses.size, plant.motors.size
-        self._pushed = np.concatenate([plant.motors, self._masses])
+        limits = plant.breakaway.copy()
+        limits[plant.motors] = np.maximum(limits[plant.motors], _RELEASED * plant.brakes)
+        self._masses = np.flatnonzero(limits > 0.0)
+        count = self._masses.size
+        self._pushed = np.concatenate(
+            [plant.motors, self._masses, np.asarray(forced, dtype=np.intp)]
+        )
         """Number of the mass that each torque acts on."""
-        rates, forced = plant.first_order()
+        place = {int(mass): k for k, mass in enumerate(self._masses)}
+        braked = plant.brakes > 0.0
+        self.brakes = np.array(
+            [place[int(m)] if b else -1 for m, b in zip(plant.motors, braked, strict=True)],
+            dtype=np.int64,
+        )
+        """Place of each axis' brake among the masses that can be held, shape (M,); -1: none."""
+        self.brake_limits = np.column_stack(
+            [limits[plant.motors], limits[plant.motors] + plant.brakes]
+        )
+        """Friction of each motor with its brake open, and closed, N m, shape (M, 2)."""
+        rates, pushes = plant.first_order()
         rows = plant.size + self._masses
-        columns = 2 * plant.size + axes + count
+        columns = 2 * plant.size + self._pushed.size
         order = 2 * plant.size
         largest = 8 * LEVELS * columns * order
         self._most_sets = max(2, _LARGEST_TABLES // largest)
         self.tables = Holding(
             masses=self._masses.astype(np.int64),
-            limits=plant.breakaway[self._masses],
-            accelerations=np.hstack([rates[rows], forced[np.ix_(rows, self._pushed)]]),
-            mobility=forced[np.ix_(rows, self._masses)],
+            limits=limits[self._masses],
+            accelerations=np.hstack([rates[rows], pushes[np.ix_(rows, self._pushed)]]),
+            mobility=pushes[np.ix_(rows, self._masses)],
             directions=np.zeros(count),
             passing=np.zeros(count, dtype=np.bool_),
             inputs=np.zeros(columns),
