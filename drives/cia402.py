@@ -1,5 +1,6 @@
 """CiA 402 power states, controlwords, statuswords and modes (IEC 61800-7-201)."""
 
+from collections.abc import Iterable
 from enum import Enum, IntEnum
 
 
@@ -58,6 +59,30 @@ class Mode(IntEnum):
     def words(self) -> str:
         """The mode in words."""
         return self.name.lower().replace("_", " ")
+
+
+MODE_WORDS = {
+    1: "profile position",
+    2: "velocity",
+    3: "profile velocity",
+    4: "profile torque",
+    6: "homing",
+    7: "interpolated position",
+    8: "cyclic position",
+    9: "cyclic velocity",
+    10: "cyclic torque",
+}
+"""Modes of operation that CiA 402 defines, by number, in words."""
+
+
+def modes_in(supported: int) -> frozenset[int]:
+    """Return the numbers of CiA 402's modes that a value of 0x6502 offers."""
+    return frozenset(mode for mode in MODE_WORDS if supported >> (mode - 1) & 1)
+
+
+def in_words(modes: Iterable[int]) -> str:
+    """Return modes in words, separated by commas."""
+    return ", ".join(MODE_WORDS.get(m, f"mode {m}") for m in sorted(modes)) or "no mode of CiA 402"
 
 
 STEP_TOWARDS_ENABLED = {  # state now: (controlword to send, state to wait for)

@@ -5,20 +5,13 @@ import struct
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 
-from canopen.objectdictionary import (
-    ObjectDictionary,
-    ODArray,
-    ODRecord,
-    ODVariable,
-    datatypes,
-    import_od,
-)
+from canopen.objectdictionary import ObjectDictionary
 from canopen.sdo import SdoAbortedError, SdoCommunicationError
 
 from drives import objects
 from drives.api import AxisLimits, DriveIdentity
 from drives.canopen_drive.line import Line, Node
-from drives.cia402 import Mode, PowerState, emergency_text
+from drives.cia402 import Mode, PowerState, emergency_text, in_words, modes_in
 from drives.errors import (
     DriveFaultError,
     DrivesError,
@@ -32,17 +25,15 @@ from drives.errors import (
     SdoTimeoutError,
     WrongDeviceError,
 )
-from drives.objects import DATA_TYPES, DataType, ObjectAddress, ObjectInfo
+from drives.objects import ObjectAddress, ObjectInfo
 from drives.profile import AxisProfile, DriveProfile
+from drives.profile.eds import info_at, read_eds, variables, writable
 from drives.units import AxisScaling, position_factor
 
 logging.getLogger("canopen").setLevel(logging.CRITICAL)  # what goes wrong is raised, not logged
 
 CIA402_DEVICE = 402
 STOP_NODE = 0x02
-_TYPE_OF_CODE: dict[int, DataType] = {
-    getattr(datatypes, name): name for name in DATA_TYPES if hasattr(datatypes, name)
-}
 
 
 class CanopenDrive:
@@ -117,10 +108,7 @@ class CanopenDrive:
 
     def info(self, address: ObjectAddress) -> ObjectInfo | None:
         """Return what the EDS says of an object, None if it has none."""
-        variable = self._variable(address)
-        if variable is None or variable.data_type not in _TYPE_OF_CODE:
-            return None
-        return ObjectInfo(address, _TYPE_OF_CODE[variable.data_type], variable.name)
+        return info_at(self.dictionary, address)
 
     def writable_parameters(self) -> Iterator[ObjectInfo]:
         """Yield every object that the EDS calls writable and that is a parameter, not a command.
@@ -129,21 +117,17 @@ class CanopenDrive:
         belongs to whoever uses the bus), and so do ``objects.COMMANDS`` and the profile's
         ``volatile_commands``.
         """
-        for index in sorted(self.dictionary):
-            if 0x1200 <= index < 0x2000:
-                continue
-            entry = self.dictionary[index]
-            variables = entry.values() if isinstance(entry, ODRecord | ODArray) else [entry]
-            for variable in variables:
-                address = ObjectAddress(variable.index, variable.subindex)
-                info = self.info(address)
-                if (
-                    info is not None
-                    and variable.access_type in ("rw", "rww", "rwr")
-                    and address.index not in objects.COMMANDS
-                    and address not in self.profile.volatile_commands
-                ):
-                    yield info
+        for variable in variables(self.dictionary):
+            address = ObjectAddress(variable.index, variable.subindex)
+            info = self.info(address)
+            if (
+                info is not None
+                and not 0x1200 <= address.index < 0x2000
+                and writable(variable)
+                and address.index not in objects.COMMANDS
+                and address not in self.profile.volatile_commands
+            ):
+                yield info
 
     def read(self, info: ObjectInfo, timeout: float | None = None) -> int | float | str:
         """Read an object.
@@ -221,10 +205,6 @@ class CanopenDrive:
             raise SdoError(*place, f"the drive's answer was wrong: {error}.") from None
         finally:
             client.RESPONSE_TIMEOUT = before
-
-    def _variable(self, address: ObjectAddress) -> ODVariable | None:
-        variable = self.dictionary.get_variable(address.index, address.subindex)
-        return variable if isinstance(variable, ODVariable) else None
 
     # --- who and what --------------------------------------------------------------------------
 
@@ -306,6 +286,12 @@ class CanopenDrive:
             If the rated torque or the encoder's resolution is zero or missing: without them no
             number from this drive means anything.
         """
+        scale = self.profile.torque
+        if isinstance(scale, str) or isinstance(scale.scale, str):
+            raise NotSupportedError(
+                f"{self.axis}: drive profile {self.profile.name} does not know what the drive's torque "
+                "units are worth (`torque`). Enter it in a profile of your own."
+            )
         rated = self.read_optional(objects.RATED_TORQUE)
         if not rated:
             raise NotSupportedError(
@@ -313,7 +299,7 @@ class CanopenDrive:
                 f"{'missing' if rated is None else 'zero'}, so torques have no scale. Enter the "
                 "motor's data in the drive first."
             )
-        self._rated_torque = rated * self.profile.rated_torque_unit
+        self._rated_torque = rated * scale.scale
         counts = self.read_optional(objects.ENCODER_COUNTS) or 0
         revolutions = self.read_optional(objects.ENCODER_REVOLUTIONS) or 1
         self._refuse_user_units(counts, revolutions)
@@ -440,10 +426,9 @@ class CanopenDrive:
         """
         supported = self.read_optional(objects.SUPPORTED_MODES)
         if supported is not None and not supported & mode.supported_bit:
-            offered = [m.words for m in Mode if supported & m.supported_bit]
             raise NotSupportedError(
                 f"{self.axis}: the drive has no mode {mode.words} ({mode.value}); 0x6502 is "
-                f"0x{supported:08X}: {', '.join(offered) or 'none of the modes known here'}."
+                f"0x{supported:08X}: {in_words(modes_in(supported))}."
             )
 
     def set_mode(self, mode: Mode, timeout: float = 1.0) -> None:
@@ -466,8 +451,11 @@ class CanopenDrive:
 
 
 def _read_eds(profile: DriveProfile) -> ObjectDictionary:
-    path = profile.path.parent / profile.eds
-    try:
-        return import_od(str(path))
-    except Exception as error:  # the EDS reader raises whatever its parser stumbles upon
-        raise ProfileError(profile.path, f"eds {profile.eds} can not be read: {error!r}") from None
+    path = profile.eds_path
+    if path is None:
+        raise ProfileError(
+            profile.path,
+            f"profile {profile.name} ships no EDS file. Give the drive's own EDS with `eds:` at the "
+            "axis in the machine profile",
+        )
+    return read_eds(path)

@@ -18,7 +18,7 @@ from drives.canopen_drive.torque_offset import why_not
 from drives.cia402 import Mode
 from drives.errors import DrivesError, LimitsError, NothingMovedError, NotSupportedError
 from drives.objects import ObjectInfo
-from drives.profile import DriveProfile, MachineProfile, load_drive
+from drives.profile import AxisProfile, DriveProfile, MachineProfile, load_drive
 from drives.trace import traced
 
 START_NODE, ENTER_PRE_OPERATIONAL = 0x01, 0x80
@@ -283,15 +283,14 @@ def connect(
                 f"{axis.name}: node id {axis.node_id} is the host's own (its heartbeat); give the "
                 "drive another one."
             )
-        if axis.drive not in profiles:
-            profiles[axis.drive] = load_drive(axis.drive, machine.path)
+        profiles[axis.name] = profile_of(axis, machine)
     with ExitStack() as stack:
         if bus is None:
             bus = open_bus(machine.bus)
             stack.callback(bus.shutdown)
         line = Line(stack.enter_context(traced(bus, trace)))
         stack.callback(_forget_nodes, line)
-        drives = [CanopenDrive(line, axis, profiles[axis.drive]) for axis in machine.axes]
+        drives = [CanopenDrive(line, axis, profiles[axis.name]) for axis in machine.axes]
         for drive in drives:
             drive.identify()
         _check_alone(line, drives)
@@ -305,6 +304,18 @@ def connect(
 def _forget_nodes(line: Line) -> None:
     for node_id in list(line.nodes):
         del line[node_id]
+
+
+def profile_of(axis: AxisProfile, machine: MachineProfile) -> DriveProfile:
+    """Return the drive profile of an axis, with the axis' own EDS file where it has one.
+
+    Raises
+    ------
+    ProfileError
+        If the profile is wrong or not there.
+    """
+    profile = load_drive(axis.drive, machine.path)
+    return profile if axis.eds is None else profile.with_eds(machine.path.parent / axis.eds)
 
 
 def _check_alone(line: Line, drives: Sequence[CanopenDrive]) -> None:

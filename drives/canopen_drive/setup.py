@@ -6,6 +6,7 @@ from drives.canopen_drive.torque_offset import TORQUE_OFFSET
 from drives.cia402 import Mode
 from drives.errors import DrivesError, NotSupportedError, SdoAbortError, SdoTimeoutError
 from drives.objects import ObjectAddress, ObjectInfo, type_bits
+from drives.profile import UNKNOWN
 
 PDO_OFF = 1 << 31
 NO_MODE = 0
@@ -117,7 +118,14 @@ def fail_safe(drive: CanopenDrive, changes: TemporaryObjects) -> None:
             f"{drive.axis}: the drive has no abort connection option 0x6007, so what it does when the "
             "host dies is not known. It may not be moved by this tool."
         )
-    changes.change(objects.ABORT_CONNECTION, drive.profile.heartbeat_reaction)
+    reaction = drive.profile.heartbeat_reaction
+    if reaction == UNKNOWN:
+        raise NotSupportedError(
+            f"{drive.axis}: drive profile {drive.profile.name} does not know which value of 0x6007 "
+            "makes the drive stop when the host dies (`heartbeat_reaction`), so it may not be moved by "
+            "this tool."
+        )
+    changes.change(objects.ABORT_CONNECTION, reaction)
     behaviour = drive.profile.error_behaviour
     if behaviour is not None and drive.read_optional(objects.ERROR_BEHAVIOUR) is not None:
         changes.change(objects.ERROR_BEHAVIOUR, behaviour)

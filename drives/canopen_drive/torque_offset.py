@@ -22,7 +22,7 @@ def why_not(drive: CanopenDrive) -> str:
         If the drive does not answer.
     """
     profile, address = drive.profile, TORQUE_OFFSET.address
-    if not profile.torque_offset:
+    if profile.torque_offset is not True:
         return f"{drive.axis}: drive profile {profile.name} does not say `torque_offset: true`"
     variable = drive.dictionary.get_variable(address.index, address.subindex)
     info = drive.info(address)

@@ -6,6 +6,7 @@ from drives.canopen_drive import CanopenDrive
 from drives.canopen_drive.interrupts import uninterrupted
 from drives.errors import DrivesError, NotSupportedError, StoppedError, WriteBackMixedError
 from drives.objects import ObjectInfo
+from drives.profile import Store
 
 SAVE_SIGNATURE = int.from_bytes(b"save", "little")
 
@@ -22,7 +23,7 @@ def store(drives: Sequence[CanopenDrive]) -> None:
         have not.  All of them work with what is in their memory.
     """
     for drive in drives:
-        if drive.profile.store is None:
+        if not isinstance(drive.profile.store, Store):
             raise NotSupportedError(
                 f"{drive.axis}: profile {drive.profile.name} does not say how this drive stores its "
                 "parameters; nothing was stored."
@@ -30,7 +31,7 @@ def store(drives: Sequence[CanopenDrive]) -> None:
     stored: list[str] = []
     for drive in drives:
         how = drive.profile.store
-        if how is not None:
+        if isinstance(how, Store):
             info = ObjectInfo(how.object, "UNSIGNED32", "store parameters")
             try:
                 with uninterrupted():

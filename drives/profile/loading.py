@@ -1,0 +1,130 @@
+"""Profiles by name or file: read, checked, and refused with file, line, key and value."""
+
+from collections.abc import Mapping
+from importlib.resources import as_file, files
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+from pydantic import ValidationError
+
+from drives.errors import ProfileError
+from drives.profile.drive import DriveProfile
+from drives.profile.machine import MachineProfile
+from drives.profile.values import LocatedError
+from drives.profile.yaml_reader import Lines, Location, line_of, read_yaml
+
+
+def load_machine(name_or_path: str | Path) -> MachineProfile:
+    """Return the machine profile of this name or file.
+
+    Raises
+    ------
+    ProfileError
+        If there is none, or it is wrong: with file, line, key and value.
+    """
+    path = _find("machines", name_or_path)
+    return _load(path, MachineProfile)
+
+
+def load_drive(name_or_path: str | Path, beside: Path | None = None) -> DriveProfile:
+    """Return the drive profile of this name or file.
+
+    Parameters
+    ----------
+    name_or_path
+        Name of a packaged profile, or path of a file.
+    beside
+        File whose folder relative paths start from (the machine profile's).
+
+    Raises
+    ------
+    ProfileError
+        As :func:`load_machine`.
+    """
+    if beside is not None and (beside.parent / name_or_path).is_file():
+        name_or_path = beside.parent / name_or_path
+    return _load(_find("drives", name_or_path), DriveProfile)
+
+
+def packaged(kind: Literal["drives", "machines"]) -> tuple[str, ...]:
+    """Return the names of the packaged profiles, in order."""
+    folder = files("profiles").joinpath(kind)
+    names = (entry.name for entry in folder.iterdir())
+    return tuple(sorted(n.removesuffix(".yaml") for n in names if n.endswith(".yaml")))
+
+
+def _find(kind: Literal["drives", "machines"], name_or_path: str | Path) -> Path:
+    path = Path(name_or_path)
+    try:
+        if path.is_file():
+            return path
+    except (OSError, ValueError) as error:
+        raise ProfileError(str(path)[:80], f"is no name of a file ({error})") from None
+    if path.suffix not in (".yaml", ".yml") and len(path.parts) == 1:
+        packaged_file = files("profiles").joinpath(kind, f"{path.name}.yaml")
+        with as_file(packaged_file) as found:
+            if found.is_file():
+                return found
+    raise ProfileError(
+        path,
+        f"no such {kind[:-1]} profile; packaged are: {', '.join(packaged(kind))}. "
+        "Give one of these names or the path of a YAML file.",
+    )
+
+
+P = TypeVar("P", DriveProfile, MachineProfile)
+
+
+def _load(path: Path, model: type[P]) -> P:
+    data, lines = read_yaml(path)
+    try:
+        profile = model.model_validate(data)
+    except ValidationError as error:
+        location, message, first = _first_of(error, lines)
+        raise ProfileError(
+            path, _sentence(location, message, first), line_of(lines, location)
+        ) from None
+    return profile.model_copy(update={"path": path})
+
+
+def _first_of(error: ValidationError, lines: Lines) -> tuple[Location, str, Mapping[str, Any]]:
+    """Return place, message and details of the error to tell.
+
+    A misspelled key also shows as a missing one: its spelling is named.  A value of several forms,
+    one of them ``unknown``, gives an error for each form: the first one is told.
+    """
+    errors = error.errors()
+    first = next((e for e in errors if e["type"] == "extra_forbidden"), errors[0])
+    location = _in_file(first["loc"], lines, missing=first["type"] == "missing")
+    message = first["msg"].removeprefix("Value error, ")
+    inner = first.get("ctx", {}).get("error")
+    if isinstance(inner, LocatedError):
+        location += inner.location
+    others = [e for e in errors if e is not first and _in_file(e["loc"], lines) == location]
+    if any(e["type"] == "literal_error" and "'unknown'" in e["msg"] for e in others):
+        message += ", or unknown"
+    return location, message, first
+
+
+def _in_file(location: Location, lines: Lines, *, missing: bool = False) -> Location:
+    """Leave out of a place what pydantic adds: names of forms and of effects."""
+    kept: Location = ()
+    for k, part in enumerate(location):
+        is_last = k == len(location) - 1
+        if (*kept, part) in lines or (missing and is_last):
+            kept = (*kept, part)
+    return kept
+
+
+def _sentence(location: tuple[str | int, ...], message: str, error: Mapping[str, Any]) -> str:
+    where = ".".join(str(p) for p in location) or "the file"
+    kind = error["type"]
+    if kind == "missing":
+        if "limits" in location:
+            return f"{where} is missing; without this limit nothing may move. Add it."
+        return f"{where} is missing. Add it."
+    if kind == "extra_forbidden":
+        return f"{where} is not a known key. Check its spelling or take it out."
+    shown = error.get("input")
+    value = f" (value {shown!r})" if isinstance(shown, str | int | float | bool) else ""
+    return f"{where}: {message[0].lower()}{message[1:]}{value}."

@@ -1,0 +1,163 @@
+"""Machine profiles: bus, axes, limits, and the model as last accepted."""
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, model_validator
+
+from drives.profile.bus import BusProfile
+from drives.profile.chain import ChainProfile, CouplingProfile
+from drives.profile.simulation import SimulationProfile
+from drives.profile.values import (
+    DIMENSIONS,
+    LocatedError,
+    Name,
+    NotNegative,
+    Number,
+    Part,
+    Positive,
+)
+from drives.units import Kind, parse_quantity
+
+
+class Limits(Part):
+    """What an axis may do during experiments, SI.  All are mandatory: no limit known, no motion."""
+
+    travel: tuple[Number, Number]
+    """Lowest and highest position, rad or m."""
+    velocity: Positive
+    acceleration: Positive
+    torque: Positive
+    following_error: Positive
+
+
+class MotorInertia(Part):
+    """The motor's inertia from its data sheet, kg m2 or kg."""
+
+    value: Positive
+    tolerance: Annotated[Number, Field(gt=0, lt=1)] = 0.1
+    """Relative."""
+
+
+class LoopProfile(Part):
+    """Gains of a drive as a person read them: without them nobody knows what a target does, SI."""
+
+    position_p: Positive
+    """1/s."""
+    velocity_p: Positive
+    """N m s/rad or N s/m."""
+    velocity_i: NotNegative
+    """N m/rad or N/m."""
+
+
+class AxisProfile(Part):
+    """One axis of a machine."""
+
+    name: Name
+    kind: Kind
+    node_id: Annotated[int, Field(ge=1, le=127, strict=True)]
+    drive: str
+    """Name of the drive profile, or path of its file."""
+    may_float: bool = False
+    """Whether the axis may be without torque while others move; never for gravity axes."""
+    serial_number: int | None = None
+    feed: Positive | None = None
+    """Metres per encoder revolution (0x608F) of a linear motor's scale; linear axes only.  A screw
+    driven by a rotary motor is a rotary axis here: torques are those of the motor."""
+    eds: str | None = None
+    """This drive's own EDS or DCF file, beside the machine profile; else the drive profile's."""
+    password: str | None = None
+    """What unlocks the drive's parameters, where its profile asks for one."""
+    encoder_counts_per_rev: Annotated[int, Field(ge=1, strict=True)] | None = None
+    """Position units per motor revolution, for drives that do not tell."""
+    torque_constant: Positive | None = None
+    """N m/A (or N/A) of the motor, for drives whose torque is per mille of a current."""
+    loop: LoopProfile | None = None
+    """The drive's gains as they are now, for drives whose gains the tool can not read in SI."""
+    motor_inertia: MotorInertia | None = None
+    limits: Limits
+    prior: ChainProfile
+    """The axis as last accepted."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _units(cls, data: Any) -> Any:
+        """Read the limits' units, which depend on the axis' kind."""
+        if not isinstance(data, dict) or not isinstance(data.get("limits"), dict):
+            return data
+        kind = data.get("kind")
+        if kind not in DIMENSIONS:
+            return data
+        dimension = DIMENSIONS[kind]
+        of_key = {
+            "travel": dimension["position"],
+            "velocity": dimension["velocity"],
+            "acceleration": dimension["acceleration"],
+            "torque": dimension["torque"],
+            "following_error": dimension["position"],
+        }
+        limits = dict(data["limits"])
+        for key, quantity in of_key.items():
+            if key not in limits:
+                continue
+            value = limits[key]
+            try:
+                limits[key] = (
+                    tuple(parse_quantity(v, quantity) for v in value)
+                    if isinstance(value, list)
+                    else parse_quantity(value, quantity)
+                )
+            except ValueError as error:
+                raise LocatedError(("limits", key), str(error)) from None
+        return {**data, "limits": limits}
+
+    @model_validator(mode="after")
+    def _travel(self) -> "AxisProfile":
+        low, high = self.limits.travel
+        if low >= high:
+            raise ValueError(f"travel must go from low to high, got {low} to {high}")
+        return self
+
+
+class MachineProfile(Part):
+    """A machine: bus, axes, limits, and the model as last accepted."""
+
+    format: Literal["fieldtool-machine/1"]
+    name: Name
+    description: str = ""
+    bus: BusProfile
+    axes: Annotated[tuple[AxisProfile, ...], Field(min_length=1, max_length=32)]
+    couplings: tuple[CouplingProfile, ...] = ()
+    """Of the prior model."""
+    simulation: SimulationProfile | None = None
+    path: Path = Field(default=Path(), exclude=True)
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "MachineProfile":
+        names = [axis.name for axis in self.axes]
+        for k, axis in enumerate(self.axes):
+            for other in self.axes[:k]:
+                if axis.name == other.name:
+                    raise LocatedError(("axes", k, "name"), f"two axes are called {axis.name}")
+                if axis.node_id == other.node_id:
+                    raise LocatedError(
+                        ("axes", k, "node_id"),
+                        f"axes {other.name} and {axis.name} both have node id {axis.node_id}; "
+                        "each drive on the bus needs its own",
+                    )
+        for where, couplings in (
+            (("couplings",), self.couplings),
+            (("simulation", "couplings"), self.simulation.couplings if self.simulation else ()),
+        ):
+            for k, coupling in enumerate(couplings):
+                a, b = coupling.axes
+                if a == b or a not in names or b not in names:
+                    raise LocatedError(
+                        (*where, k, "axes"), f"{a} - {b} does not join two of the axes {names}"
+                    )
+        if self.simulation and len(self.simulation.axes) != len(names):
+            raise LocatedError(
+                ("simulation", "axes"),
+                f"{len(self.simulation.axes)} simulated axes for {len(names)} axes",
+            )
+        return self
