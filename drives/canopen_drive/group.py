@@ -59,8 +59,9 @@ class CanopenGroup:
 
     @property
     def shortest_cycle(self) -> float:
-        """Shortest cycle time that fits the bus, seconds."""
-        return shortest_cycle(len(self._drives), self.machine.bus.bitrate)
+        """Shortest cycle time that fits the bus and that the machine profile allows, seconds."""
+        bus = self.machine.bus
+        return max(shortest_cycle(len(self._drives), bus.bitrate), bus.shortest_cycle)
 
     @cached_property
     def _offset_obstacles(self) -> tuple[str, ...]:

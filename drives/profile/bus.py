@@ -1,15 +1,50 @@
-"""Where a machine's CAN bus is."""
+"""Where a machine's bus is."""
 
-from typing import Annotated
+from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import Field, StrictBool, StrictFloat, StrictInt, StrictStr
 
-from drives.profile.values import Part
+from drives.profile.values import Part, Seconds
 
 
 class BusProfile(Part):
     """Where the machine's CAN bus is, in python-can's words."""
 
-    interface: str
+    interface: Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]{1,64}$")]
     channel: str | int | None = None
-    bitrate: Annotated[int, Field(ge=10_000, le=1_000_000)] = 1_000_000
+    bitrate: Annotated[int, Field(ge=10_000, le=1_000_000, strict=True)] = 1_000_000
+    options: dict[str, StrictBool | StrictInt | StrictFloat | StrictStr] = Field(default_factory=dict)
+    """What else the adapter's python-can interface takes, by name; others are refused."""
+    shortest_cycle: Annotated[Seconds, Field(ge=0.001, le=0.1)] = 0.001
+    """The tool uses no cycle shorter than this, however short one would fit the bit rate: for a
+    computer or an adapter that can not keep up."""
+    sync: Literal["host", "kernel"] = "host"
+    """Who times the SYNC: the tool, or the kernel's broadcast manager (SocketCAN only)."""
+
+    def elsewhere(
+        self,
+        interface: str | None = None,
+        channel: str | int | None = None,
+        bitrate: int | None = None,
+    ) -> "BusProfile":
+        """Return it with what is given changed.
+
+        Another interface drops channel and options, which belong to the one before.
+        """
+        kept = self.as_dict()
+        if interface is not None and interface != self.interface:
+            kept = {"interface": interface, "bitrate": self.bitrate}
+            kept |= {"shortest_cycle": f"{self.shortest_cycle * 1000:g} ms"}
+        if channel is not None:
+            kept["channel"] = channel
+        if bitrate is not None:
+            kept["bitrate"] = bitrate
+        return BusProfile.model_validate(kept)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return it as it stands in a file; what is usual is left out."""
+        data = self.model_dump(exclude_defaults=True)
+        data |= {"interface": self.interface, "bitrate": self.bitrate}
+        if "shortest_cycle" in data:
+            data["shortest_cycle"] = f"{self.shortest_cycle * 1000:g} ms"
+        return data

@@ -2,16 +2,54 @@
 
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import can
 
 from drives.sim.running import RunningMachine
-from drives.sim.scheduler import NANOSECONDS
+from drives.sim.scheduler import NANOSECONDS, nanoseconds
 
-WAIT = 0.0005
+WAIT = 0.001
 """Longest wait for a frame, s: as often, at least, time passes for the nodes."""
 LARGEST_STEP = 0.05
 """Wall time, s, that is made up for at most at once; what a longer pause held is left out."""
+LATE = 0.002
+"""Seconds between two looks at the bus above which the computer did not keep up."""
+WARM_UP = 0.01
+"""Virtual seconds that another machine of the kind lives first, so that all is compiled."""
+PAUSE = 0.01
+"""Seconds between two tries of a bus that takes and gives nothing."""
+
+
+@dataclass(frozen=True)
+class Served:
+    """How serving went; times in s of wall time."""
+
+    seconds: float
+    frames: int
+    """Received and handled."""
+    late: int
+    """Looks at the bus that came more than ``LATE`` after the one before."""
+    worst: float
+    """Longest time between two looks."""
+    left_out: float
+    """Time that did not pass for the nodes, because the computer was too slow or paused."""
+    bus_away: float
+    """Time for which the bus neither took nor gave frames."""
+
+    @property
+    def sentence(self) -> str:
+        """All of it for a person."""
+        parts = [
+            f"Served {self.frames} frames in {self.seconds:.1f} s",
+            f"frames waited {1000 * self.worst:.2g} ms at most",
+            f"{self.late} times more than {1000 * LATE:g} ms",
+        ]
+        if self.left_out:
+            parts.append(f"{self.left_out:.2g} s were left out, because this computer was too slow")
+        if self.bus_away:
+            parts.append(f"the bus was away for {self.bus_away:.2g} s")
+        return "; ".join(parts) + "."
 
 
 def serve(
@@ -19,13 +57,15 @@ def serve(
     bus: can.BusABC,
     stop: Callable[[], bool],
     *,
+    begun: Callable[[], None] = lambda: None,
     clock: Callable[[], float] = time.monotonic,
-) -> float:
+) -> Served:
     """Let the nodes of a machine live on a bus until ``stop`` returns True.
 
     Frames are handled as they come; a SYNC latches inputs and lets outputs act at the moment at
     which it is received.  Time passes by the wall clock, so the drives' behaviour has the jitter
-    of this computer.
+    of this computer.  A bus that goes away does not stop the drives: they miss frames, and time
+    passes for them, as for real ones whose cable was pulled.
 
     Parameters
     ----------
@@ -34,33 +74,25 @@ def serve(
     bus
         Open; it is left open.
     stop
-        Asked at least every ``WAIT`` seconds.
+        Asked at least every ``PAUSE`` seconds.
+    begun
+        Called when the nodes can be spoken to; they have sent their boot-up messages then.
     clock
         Seconds that never go back.
-
-    Returns
-    -------
-    float
-        Seconds of wall time that were left out because the computer was too slow or paused;
-        0 if it kept up.
-
-    Raises
-    ------
-    can.CanError
-        If the bus fails.
     """
-    outgoing: list[can.Message] = []
-
-    def transmit(_time: int, cob_id: int, data: bytes) -> None:
-        outgoing.append(can.Message(arbitration_id=cob_id, is_extended_id=False, data=data))
-
-    machine.listen(transmit)
-    left_out = 0.0
+    _compile(machine)
+    line = _Line(machine, bus)
+    begun()
     began, virtual_began = clock(), machine.time
+    last, late, worst, left_out = began, 0, 0.0, 0.0
     try:
         while not stop():
-            message = bus.recv(WAIT)
-            now = virtual_began + int((clock() - began - left_out) * NANOSECONDS)
+            message = line.receive()
+            present = clock()
+            pause, last = present - last, present
+            waited = pause - (WAIT if message is None else 0.0)
+            late, worst = late + (waited > LATE), max(worst, waited)
+            now = virtual_began + int((present - began - left_out) * NANOSECONDS)
             behind = (now - machine.time) / NANOSECONDS
             if behind > LARGEST_STEP:
                 left_out += behind - LARGEST_STEP
@@ -68,12 +100,59 @@ def serve(
             machine.advance_to(now)
             if message is not None and _is_for_nodes(message):
                 machine.receive(message.arbitration_id, bytes(message.data))
-            for answer in outgoing:
-                bus.send(answer)
-            outgoing.clear()
+            line.flush()
     finally:
-        machine.unlisten(transmit)
-    return left_out
+        line.close()
+    return Served(last - began, line.frames, late, worst, left_out, line.away)
+
+
+class _Line:
+    """The bus as the nodes have it: what can not be sent is lost, what can not be received is not."""
+
+    def __init__(self, machine: RunningMachine, bus: can.BusABC) -> None:
+        self._machine, self._bus = machine, bus
+        self._outgoing: list[can.Message] = []
+        self.frames, self.away = 0, 0.0
+        machine.listen(self._transmit)
+        for node in machine.nodes:
+            self._transmit(0, 0x700 + node.node_id, b"\0")
+        self.flush()
+
+    def receive(self) -> can.Message | None:
+        """Return the next frame; None if none comes within ``WAIT``."""
+        try:
+            message = self._bus.recv(WAIT)
+        except (can.CanError, OSError):
+            begin = time.monotonic()
+            time.sleep(PAUSE)
+            self.away += time.monotonic() - begin
+            return None
+        self.frames += message is not None
+        return message
+
+    def flush(self) -> None:
+        """Send what the nodes have to say."""
+        for answer in self._outgoing:
+            try:
+                self._bus.send(answer)
+            except (can.CanError, OSError):
+                break
+        self._outgoing.clear()
+
+    def close(self) -> None:
+        """Listen to the nodes no more."""
+        self._machine.unlisten(self._transmit)
+
+    def _transmit(self, _time: int, cob_id: int, data: bytes) -> None:
+        self._outgoing.append(can.Message(arbitration_id=cob_id, is_extended_id=False, data=data))
+
+
+def _compile(machine: RunningMachine) -> None:
+    other = RunningMachine(machine.description)
+    for node in other.nodes:
+        other.receive(0, bytes((1, node.node_id)))
+    other.receive(0x80, b"")
+    other.advance_to(nanoseconds(WARM_UP))
 
 
 def _is_for_nodes(message: can.Message) -> bool:

@@ -34,7 +34,9 @@ from drives.errors import (
     WriteBackMixedError,
 )
 from drives.parameters import Change
+from drives.profile import MachineProfile
 from fieldtool import workflow
+from fieldtool.cli.bus_options import Bitrate, Channel, Interface, on_bus
 from fieldtool.cli.screen import (
     TerminalScreen,
     model_table,
@@ -251,6 +253,9 @@ def run(
     motor_inertia: Motor = "measured",
     seconds: Seconds = None,
     plan_only: PlanOnly = False,
+    interface: Interface = None,
+    channel: Channel = None,
+    bitrate: Bitrate = None,
     trace: TraceWanted = False,
     trace_file: TraceFile = None,
     out: Out = None,
@@ -262,11 +267,12 @@ def run(
     options = _options(plan, write, store, motor_inertia, seconds, traced)
     console = _console(as_json)
     if plan_only:
-        _show_plan(machine, options, console, as_json)
+        profile = on_bus(machine, interface, channel, bitrate)
+        _show_plan(profile, options, console, as_json)
         return
     with _stop_key() as key, TerminalScreen(console, _may_move(yes)) as screen:
         result = workflow.run(
-            machine,
+            on_bus(machine, interface, channel, bitrate),
             folder,
             options,
             screen=_StoppableScreen(screen, key),
@@ -317,6 +323,9 @@ def measure(
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask before moving.")] = False,
     seconds: Seconds = None,
     plan_only: PlanOnly = False,
+    interface: Interface = None,
+    channel: Channel = None,
+    bitrate: Bitrate = None,
     trace: TraceWanted = False,
     trace_file: TraceFile = None,
     out: Out = None,
@@ -328,18 +337,25 @@ def measure(
     options = _options(plan, False, False, "measured", seconds, traced)
     console = _console(as_json)
     if plan_only:
-        _show_plan(machine, options, console, as_json)
+        profile = on_bus(machine, interface, channel, bitrate)
+        _show_plan(profile, options, console, as_json)
         return
     with _stop_key() as key, TerminalScreen(console, _may_move(yes)) as screen:
         seconds = workflow.measure(
-            machine, folder, options, screen=_StoppableScreen(screen, key), stop_requested=key
+            on_bus(machine, interface, channel, bitrate),
+            folder,
+            options,
+            screen=_StoppableScreen(screen, key),
+            stop_requested=key,
         )
     console.print(f"{seconds:.0f} s of machine time; the recording is in {folder}")
     if as_json:
         _print_json({"folder": str(folder), "time": {"machine_s": seconds}})
 
 
-def _show_plan(machine: str, options: workflow.Options, console: Console, as_json: bool) -> None:
+def _show_plan(
+    machine: MachineProfile, options: workflow.Options, console: Console, as_json: bool
+) -> None:
     """Show the fast plan for a machine; nothing moves."""
     if options.plan != "fast":
         raise typer.BadParameter("--plan-only is for the fast plan")
@@ -447,6 +463,9 @@ def write(
     folder: Annotated[Path, typer.Argument(help="Session folder with a tuning.")],
     yes: Yes = False,
     store: Store = False,
+    interface: Interface = None,
+    channel: Channel = None,
+    bitrate: Bitrate = None,
     trace: TraceWanted = False,
     trace_file: TraceFile = None,
 ) -> None:
@@ -456,7 +475,9 @@ def write(
     options = workflow.Options(write=True, store=store, trace=traced)
     with _stop_key() as key, TerminalScreen(console) as screen:
         stoppable = _StoppableScreen(screen, key)
-        result = workflow.write(folder, options, _asker(console, yes, key, store), screen=stoppable)
+        ask = _asker(console, yes, key, store)
+        profile = on_bus(folder / "machine.yaml", interface, channel, bitrate)
+        result = workflow.write(folder, options, ask, screen=stoppable, machine=profile)
     show_parameters(console, result)
 
 
@@ -469,6 +490,9 @@ def restore(
     store: Annotated[
         bool, typer.Option("--store", help="Store the restored parameters too.")
     ] = False,
+    interface: Interface = None,
+    channel: Channel = None,
+    bitrate: Bitrate = None,
     trace: TraceWanted = False,
     trace_file: TraceFile = None,
 ) -> None:
@@ -478,7 +502,8 @@ def restore(
         machine = str(folder / "machine.yaml")
     traced = trace_path(trace, trace_file, folder)
     with _stop_key():
-        written = workflow.restore(machine, backup, store, traced)
+        profile = on_bus(machine, interface, channel, bitrate)
+        written = workflow.restore(profile, backup, store, traced)
     console = _console(False)
     console.print(f"{len(written)} parameters differed and were restored; all were read back.")
     console.print(
@@ -514,13 +539,15 @@ def export(
 def simulate(
     machine: Machine,
     interface: Annotated[str, typer.Option(help="python-can interface.")],
-    channel: Annotated[str, typer.Option(help="Its channel.")],
+    channel: Channel = None,
+    bitrate: Bitrate = None,
 ) -> None:
     """Serve the simulated machine's nodes in real time on a bus, until Ctrl-C."""
     console = _console(False)
     with _stop_key() as key:
-        console.print(f"Serving {machine} on {interface} {channel}; Ctrl-C ends it.")
-        workflow.simulate(machine, interface, channel, key)
+        profile = on_bus(machine, interface, channel, bitrate)
+        served = workflow.simulate(profile, key, console.print)
+    console.print(served)
 
 
 def _lengths(masses: Sequence[str]) -> dict[str, int]:

@@ -4,7 +4,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from drives.bus import open_bus
-from drives.profile import BusProfile, load_machine
+from drives.errors import BusError, ProfileError
+from drives.profile import MachineProfile, load_machine
 from fieldtool.errors import NotEnoughDataError
 from fieldtool.identify.prediction import LoadPrediction, predict_load
 from fieldtool.identify.recorded import identify_recording
@@ -16,6 +17,9 @@ from fieldtool.records.recording import (
     load,
     save,
 )
+
+VIRTUAL_TIME = "fieldsim"
+"""python-can interface of the simulated machine in virtual time."""
 
 
 def import_folder(folder: Path, out: Path) -> Recording:
@@ -70,25 +74,59 @@ def _delay_of(model: MachineModel) -> float:
 
 
 def simulate(
-    machine: str, interface: str, channel: str, stop_requested: Callable[[], bool]
-) -> None:
-    """Serve a simulated machine's nodes in real time on a bus until told to stop.
+    machine: str | Path | MachineProfile,
+    stop_requested: Callable[[], bool],
+    say: Callable[[str], None] = lambda _: None,
+) -> str:
+    """Serve a simulated machine's nodes in real time on its profile's bus until told to stop.
+
+    Parameters
+    ----------
+    machine
+        Name or file of a machine profile, or the profile.
+    stop_requested
+        Asked many times a second.
+    say
+        Is told when the nodes can be spoken to.
+
+    Returns
+    -------
+    str
+        How well this computer kept up, in a sentence.
 
     Raises
     ------
     ProfileError
         If the machine has no `simulation` section.
     BusError
-        If the bus can not be opened.
+        If the bus can not be opened, or ends.
     """
     from drives.sim.machine import simulated_machine
     from drives.sim.running import RunningMachine
     from drives.sim.serve import serve
 
-    profile = load_machine(machine)
+    profile = machine if isinstance(machine, MachineProfile) else load_machine(machine)
+    if profile.simulation is None:
+        raise ProfileError(
+            profile.path, "has no `simulation` section, so it can not be simulated. Add one."
+        )
+    if profile.bus.interface == VIRTUAL_TIME:
+        raise BusError(
+            f"{VIRTUAL_TIME} brings its own simulated machine, in virtual time. Serve nodes on a bus "
+            "that another program can reach: --interface socketcan --channel vcan0."
+        )
     running = RunningMachine(simulated_machine(profile))
-    bus = open_bus(BusProfile(interface=interface, channel=channel, bitrate=profile.bus.bitrate))
+    bus = open_bus(profile.bus)
     try:
-        serve(running, bus, stop_requested)
+        report = serve(
+            running,
+            bus,
+            stop_requested,
+            begun=lambda: say(
+                f"Serving {profile.name} on {profile.bus.interface} {profile.bus.channel}; Ctrl-C "
+                "ends it."
+            ),
+        )
     finally:
         bus.shutdown()
+    return report.sentence

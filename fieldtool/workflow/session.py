@@ -229,8 +229,12 @@ def open_session(
 
 
 def _resolved(profile: MachineProfile) -> dict[str, Any]:
-    """Return the profile as its file has it, with drive profiles found from the folder too."""
+    """Return the profile as its file has it, with drive profiles found from the folder too.
+
+    The bus is the one that is used, which may be another one than the file's.
+    """
     data: dict[str, Any] = yaml.safe_load(profile.path.read_text(encoding="utf-8"))
+    data["bus"] = profile.bus.as_dict()
     for axis in data["axes"]:
         beside = profile.path.parent / str(axis["drive"])
         if beside.is_file():

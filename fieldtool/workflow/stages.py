@@ -207,8 +207,11 @@ def write(
     confirm: Confirm,
     *,
     screen: Screen | None = None,
+    machine: MachineProfile | None = None,
 ) -> WriteBack:
     """Write a session folder's tuning into the machine's drives.
+
+    ``machine`` is the session's own profile, on another bus if need be; the folder's where None.
 
     Raises
     ------
@@ -217,10 +220,8 @@ def write(
     """
     folder = SessionFolder(folder_path)
     tuning = read_tuning(folder.tuning)
-    with open_session(folder.machine, folder_path, screen, never, True, "write", options) as (
-        s,
-        group,
-    ):
+    profile = machine or folder.machine
+    with open_session(profile, folder_path, screen, never, True, "write", options) as (s, group):
         result = _write(s, group, tuning, options, confirm)
         if result is None:
             raise FileFormatError(folder.tuning, "writing was not asked for")
@@ -228,7 +229,10 @@ def write(
 
 
 def restore(
-    machine: str | Path, backup: Path, store: bool = False, trace: Path | None = None
+    machine: str | Path | MachineProfile,
+    backup: Path,
+    store: bool = False,
+    trace: Path | None = None,
 ) -> tuple[HeldObject, ...]:
     """Bring a backup back into a machine's drives; return what had to be written.
 
@@ -239,7 +243,8 @@ def restore(
     """
     path = backup / "parameters-before.yaml" if backup.is_dir() else backup
     load_backup(path)
-    with connect(load_machine(machine), trace=trace) as group:
+    profile = machine if isinstance(machine, MachineProfile) else load_machine(machine)
+    with connect(profile, trace=trace) as group:
         return undo(group.drives, path, store)
 
 

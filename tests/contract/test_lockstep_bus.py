@@ -15,7 +15,7 @@ from drives.sim.lockstep_bus import NOT_IMITATED, LockstepBus, register, unregis
 from drives.sim.machine import SimulatedDrive, SimulatedMachine
 from drives.sim.plant import ChainParameters
 from drives.sim.running import RunningMachine
-from drives.sim.serve import serve
+from drives.sim.serve import Served, serve
 
 GAINS = {"position_p": 30.0, "velocity_p": 2.0, "velocity_i": 40.0}
 
@@ -354,12 +354,19 @@ class TestServing:
             can.Bus(interface="virtual", channel="serve") as near,
         ):
             ended = threading.Event()
-            left_out: list[float] = []
+            reports: list[Served] = []
+            ready = threading.Event()
             thread = threading.Thread(
-                target=lambda: left_out.append(serve(running, far, ended.is_set))
+                target=lambda: reports.append(serve(running, far, ended.is_set, begun=ready.set))
             )
             thread.start()
             try:
+                assert ready.wait(60.0)
+                boots = [near.recv(5.0) for _ in range(2)]
+                assert [(m.arbitration_id, bytes(m.data)) for m in boots] == [
+                    (0x701, b"\0"),
+                    (0x702, b"\0"),
+                ]
                 near.send(frame(0x601, UPLOAD_DEVICE_TYPE))
                 assert near.recv(5.0).arbitration_id == 0x581
                 near.send(frame(0x601, struct.pack("<BHBI", 0x2B, 0x1017, 0, 20)))
@@ -371,13 +378,50 @@ class TestServing:
                 thread.join(10.0)
         assert running.sync_count == 1
         assert running.now > 0.03
-        assert len(left_out) == 1
+        (report,) = reports
+        assert report.frames == 3
+        assert report.bus_away == 0
+        assert "Served 3 frames" in report.sentence
 
     def test_a_slow_computer_leaves_time_out_instead_of_racing(self):
         running = RunningMachine(machine())
         ticks = iter((0.0, 10.0, 10.0))
         stops = iter((False, True))
         with can.Bus(interface="virtual", channel="slow") as far:
-            left_out = serve(running, far, lambda: next(stops), clock=lambda: next(ticks))
+            report = serve(running, far, lambda: next(stops), clock=lambda: next(ticks))
         assert running.now == pytest.approx(0.05)
-        assert left_out == pytest.approx(9.95)
+        assert report.left_out == pytest.approx(9.95)
+        assert report.worst == pytest.approx(10.0, abs=0.01)
+
+    def test_a_bus_that_goes_away_does_not_stop_the_drives(self):
+        """Time passes for the nodes, and they are there again when the bus is."""
+        running = RunningMachine(machine())
+        gone = [True]
+
+        class Cut(type(can.Bus(interface="virtual", channel="cut"))):
+            def recv(self, timeout=None):
+                if gone[0]:
+                    raise can.CanOperationError("Network is down")
+                return super().recv(timeout)
+
+            def send(self, msg, timeout=None):
+                if gone[0]:
+                    raise can.CanOperationError("Network is down")
+                super().send(msg, timeout)
+
+        with Cut(channel="cut") as far, can.Bus(interface="virtual", channel="cut") as near:
+            ended, reports = threading.Event(), []
+            thread = threading.Thread(
+                target=lambda: reports.append(serve(running, far, ended.is_set))
+            )
+            thread.start()
+            try:
+                time.sleep(0.2)
+                gone[0] = False
+                near.send(frame(0x601, UPLOAD_DEVICE_TYPE))
+                assert near.recv(5.0).arbitration_id == 0x581
+            finally:
+                ended.set()
+                thread.join(30.0)
+        assert reports[0].bus_away > 0.01
+        assert running.now > 0.1

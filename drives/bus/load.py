@@ -1,74 +1,14 @@
-"""Open a CAN bus, tell its time, and count what fits on it."""
+"""Count what fits on a CAN bus."""
 
-import time
 from dataclasses import dataclass
 from math import ceil
-from typing import Protocol, cast
 
-import can
-
-from drives.errors import BusError, LimitsError
-from drives.profile import BusProfile
+from drives.errors import LimitsError
 
 MAX_CYCLIC_LOAD = 0.9
 """Share of the bus that SYNC and PDOs may take in the worst case; the rest is for SDO, EMCY, NMT."""
 
 PDO_BYTES = 8
-
-
-class Clock(Protocol):
-    """Time of a bus, seconds."""
-
-    def now(self) -> float:
-        """Present time."""
-
-    def wait_until(self, moment: float) -> None:
-        """Return at that time, at once if it has passed."""
-
-
-class WallClock:
-    """Time of the host: monotonic."""
-
-    def now(self) -> float:
-        """Seconds since an arbitrary start."""
-        return time.perf_counter()
-
-    def wait_until(self, moment: float) -> None:
-        """Sleep, and spin for the last part, which sleeping would miss."""
-        while (left := moment - time.perf_counter()) > 0:
-            if left > 0.0005:
-                time.sleep(left - 0.0004)
-
-
-def clock_of(bus: can.BusABC) -> Clock:
-    """Return the bus' own clock if it brings one, else the host's."""
-    own = getattr(bus, "clock", None)
-    return cast(Clock, own) if own is not None else WallClock()
-
-
-def not_imitated(bus: can.BusABC) -> tuple[str, ...]:
-    """Return what the bus says it does not imitate of a real one; empty for a real bus."""
-    return tuple(getattr(bus, "not_imitated", ()))
-
-
-def open_bus(profile: BusProfile) -> can.BusABC:
-    """Open the machine's bus.
-
-    Raises
-    ------
-    BusError
-        If python-can knows no such interface, or the interface can not be opened.
-    """
-    try:
-        return can.Bus(
-            interface=profile.interface, channel=profile.channel, bitrate=profile.bitrate
-        )
-    except Exception as error:  # adapters' libraries raise whatever they like
-        raise BusError(
-            f"bus {profile.interface} {profile.channel}: can not be opened ({error}). Is the "
-            "adapter plugged in, the interface up, and its bit rate "
-            f"{profile.bitrate} bit/s?"
-        ) from error
 
 
 def frame_bits(data_bytes: int) -> int:

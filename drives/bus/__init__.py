@@ -1,0 +1,28 @@
+"""The CAN bus under everything: open one, tell its time, count what fits on it.
+
+``opening`` opens whatever python-can opens, ``adapters`` knows python-can's interfaces and what they
+take, ``kernel_link`` and ``kernel_bus`` what only SocketCAN has, ``trouble`` reads error frames.
+"""
+
+from drives.bus.clock import Clock, WallClock, clock_of, not_imitated
+from drives.bus.load import (
+    MAX_CYCLIC_LOAD,
+    CyclicLoad,
+    check_cycle,
+    frame_bits,
+    shortest_cycle,
+)
+from drives.bus.opening import open_bus
+
+__all__ = [
+    "MAX_CYCLIC_LOAD",
+    "Clock",
+    "CyclicLoad",
+    "WallClock",
+    "check_cycle",
+    "clock_of",
+    "frame_bits",
+    "not_imitated",
+    "open_bus",
+    "shortest_cycle",
+]
