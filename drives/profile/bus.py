@@ -13,7 +13,9 @@ class BusProfile(Part):
     interface: Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]{1,64}$")]
     channel: str | int | None = None
     bitrate: Annotated[int, Field(ge=10_000, le=1_000_000, strict=True)] = 1_000_000
-    options: dict[str, StrictBool | StrictInt | StrictFloat | StrictStr] = Field(default_factory=dict)
+    options: dict[str, StrictBool | StrictInt | StrictFloat | StrictStr] = Field(
+        default_factory=dict
+    )
     """What else the adapter's python-can interface takes, by name; others are refused."""
     shortest_cycle: Annotated[Seconds, Field(ge=0.001, le=0.1)] = 0.001
     """The tool uses no cycle shorter than this, however short one would fit the bit rate: for a
