@@ -45,6 +45,11 @@ class ObjectAddress:
     def __str__(self) -> str:
         return f"0x{self.index:04X}:{self.subindex:02X}"
 
+    @property
+    def short(self) -> str:
+        """As manuals write it: without a sub-index where that is 0."""
+        return str(self) if self.subindex else f"0x{self.index:04X}"
+
     @classmethod
     def parse(cls, text: str) -> "ObjectAddress":
         """Read ``0x2010:01`` or ``0x6072``.
@@ -203,6 +208,7 @@ GEAR_MOTOR = _standard(0x6091, 1, "UNSIGNED32", "gear: motor revolutions")
 GEAR_SHAFT = _standard(0x6091, 2, "UNSIGNED32", "gear: shaft revolutions")
 FEED_CONSTANT = _standard(0x6092, 1, "UNSIGNED32", "feed constant: feed")
 FEED_REVOLUTIONS = _standard(0x6092, 2, "UNSIGNED32", "feed constant: shaft revolutions")
+VELOCITY_UNIT = _standard(0x60A9, 0, "UNSIGNED32", "SI unit velocity")
 INTERPOLATION_VALUE = _standard(0x60C2, 1, "UNSIGNED8", "interpolation time period value")
 INTERPOLATION_INDEX = _standard(0x60C2, 2, "INTEGER8", "interpolation time index")
 SUPPORTED_MODES = _standard(0x6502, 0, "UNSIGNED32", "supported drive modes")

@@ -75,12 +75,12 @@ class AxisScaling:
     position: float
     """rad or m per position unit of 0x6064, 0x607A."""
     velocity: float
-    """rad/s or m/s per velocity unit of 0x606C."""
+    """rad/s or m/s per velocity unit of 0x606C; NaN where nobody knows."""
     torque: float
     """N m or N per unit of 0x6071, 0x6077 (one per mille of the rated torque)."""
 
     def __post_init__(self) -> None:
-        if not (self.position > 0 and self.velocity > 0 and self.torque > 0):
+        if not (self.position > 0 and self.torque > 0) or self.velocity <= 0:
             raise ValueError(f"scale factors must be positive, got {self}")
 
     def position_units(self, value: float) -> int:
@@ -116,6 +116,58 @@ def position_factor(kind: Kind, counts: int, revolutions: int, feed: float | Non
     if feed is None or feed <= 0:
         raise ValueError("a linear axis needs `feed` in the machine profile, metres a revolution")
     return feed * revolutions / counts
+
+
+_PREFIXES = range(-6, 7)
+_NUMERATORS = {0xB4: "rev", 0xB5: "inc", 0x10: "rad", 0x41: "deg"}
+_DENOMINATORS = {0x03: 1.0, 0x47: 60.0}
+"""Seconds; codes of SI units in object 0x60A9 (CiA 303-2): second and minute."""
+
+
+def velocity_factor(unit: str, position: float, counts: float, coded: int | None = None) -> float:
+    """Return rad/s (or m/s) per velocity unit of 0x606C and 0x60FF.
+
+    Parameters
+    ----------
+    unit
+        As drive profiles have it.
+    position
+        Rad (or m) per position unit.
+    counts
+        Position units per motor revolution.
+    coded
+        Value of 0x60A9: prefix in bits 31 to 24, numerator 23 to 16, denominator 15 to 8; needed for
+        the unit ``0x60A9`` alone.
+
+    Raises
+    ------
+    ValueError
+        If the code is missing or means no velocity that is known here.
+    """
+    rpm = position * counts / 60
+    match unit:
+        case "position units/s":
+            return position
+        case "rpm":
+            return rpm
+        case "0.001 rpm":
+            return rpm / 1000
+        case "counts * 512 / 1875":
+            return rpm * 1875 / (512 * counts)
+        case "0x60A9" if coded is not None:
+            return _decoded_velocity(coded, position, counts)
+    raise ValueError(f"velocity unit {unit} can not be told")
+
+
+def _decoded_velocity(coded: int, position: float, counts: float) -> float:
+    prefix = (coded >> 24 & 0xFF) - (0x100 if coded >> 31 & 1 else 0)
+    numerator = _NUMERATORS.get(coded >> 16 & 0xFF)
+    seconds = _DENOMINATORS.get(coded >> 8 & 0xFF)
+    if numerator is None or seconds is None or prefix not in _PREFIXES:
+        raise ValueError(f"0x60A9 = 0x{coded:08X} is no velocity unit that is known here")
+    turn = position * counts
+    worth = {"rev": turn, "inc": position, "rad": turn / (2 * pi), "deg": turn / 360}[numerator]
+    return float(worth * 10.0**prefix / seconds)
 
 
 _ON_LINEAR_AXES = {

@@ -226,7 +226,7 @@ def channel_of(
 ) -> Channel:
     """Return the run-time state of an axis about to be moved, its limits in drive units."""
     scale, limits = drive.scaling, drive.limits
-    units = min(limits.velocity * cycle_time / scale.velocity, _MOST_UNITS)
+    units = min(limits.velocity * cycle_time / scale.position, _MOST_UNITS)
     span = ceil(SPAN_UNITS / units)
     window = floor(min(limits.following_error / scale.position * (1 + 1e-12), _MOST_UNITS))
     return Channel(

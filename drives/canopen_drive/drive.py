@@ -4,13 +4,16 @@ import logging
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 
 from canopen.objectdictionary import ObjectDictionary
 from canopen.sdo import SdoAbortedError, SdoCommunicationError
 
 from drives import objects
 from drives.api import AxisLimits, DriveIdentity
+from drives.canopen_drive.conversion import Conversion, quantity_objects
 from drives.canopen_drive.line import Line, Node
+from drives.canopen_drive.scaling import Scaled, read_scaling
 from drives.cia402 import Mode, PowerState, emergency_text, in_words, modes_in
 from drives.errors import (
     DriveFaultError,
@@ -28,7 +31,7 @@ from drives.errors import (
 from drives.objects import ObjectAddress, ObjectInfo
 from drives.profile import AxisProfile, DriveProfile
 from drives.profile.eds import info_at, read_eds, variables, writable
-from drives.units import AxisScaling, position_factor
+from drives.units import AxisScaling
 
 logging.getLogger("canopen").setLevel(logging.CRITICAL)  # what goes wrong is raised, not logged
 
@@ -45,8 +48,7 @@ class CanopenDrive:
         self.node = Node(axis.node_id, ObjectDictionary())
         line.add_node(self.node)
         self._identity: DriveIdentity | None = None
-        self._scaling: AxisScaling | None = None
-        self._rated_torque = 0.0
+        self._scaled: Scaled | None = None
 
     @property
     def axis(self) -> str:
@@ -93,16 +95,21 @@ class CanopenDrive:
         return self._identity
 
     @property
+    def scaled(self) -> Scaled:
+        """Worth of the drive's units, and where it comes from; known once they were read."""
+        if self._scaled is None:
+            raise NothingMovedError(f"{self.axis}: the drive's units were not read yet")
+        return self._scaled
+
+    @property
     def scaling(self) -> AxisScaling:
         """Worth of the drive's units; known once :meth:`read_scaling` was called."""
-        if self._scaling is None:
-            raise NothingMovedError(f"{self.axis}: the drive's units were not read yet")
-        return self._scaling
+        return self.scaled.axis
 
     @property
     def rated_torque(self) -> float:
         """N m or N that 1000 per mille of torque are."""
-        return self._rated_torque
+        return self.scaled.rated_torque
 
     # --- objects -------------------------------------------------------------------------------
 
@@ -137,6 +144,7 @@ class CanopenDrive:
         SdoAbortError, SdoTimeoutError, SdoError
             If the drive refuses, does not answer, or answers something else.
         """
+        info = self._typed(info)
         address = info.address
         with self._asking(address, "read", timeout):
             data = self.node.sdo.upload(address.index, address.subindex)
@@ -174,6 +182,7 @@ class CanopenDrive:
         SdoAbortError, SdoTimeoutError, SdoError
             If the drive refuses or does not answer, or the value does not fit the type.
         """
+        info = self._typed(info)
         address = info.address
         try:
             data = info.encode(value)
@@ -181,6 +190,11 @@ class CanopenDrive:
             raise SdoError(self.axis, address.index, address.subindex, f"{error}.") from None
         with self._asking(address, "write", timeout):
             self.node.sdo.download(address.index, address.subindex, data)
+
+    def _typed(self, info: ObjectInfo) -> ObjectInfo:
+        """Return the object with the type that this drive's EDS gives it."""
+        own = self.info(info.address)
+        return info if own is None else replace(info, type=own.type)
 
     @contextmanager
     def _asking(self, address: ObjectAddress, verb: str, timeout: float | None) -> Iterator[None]:
@@ -278,60 +292,31 @@ class CanopenDrive:
             return ""
 
     def read_scaling(self) -> AxisScaling:
-        """Read what the drive's position and torque units are worth.
+        """Read what the drive's position, velocity and torque units are worth.
 
         Raises
         ------
         NotSupportedError
-            If the rated torque or the encoder's resolution is zero or missing: without them no
-            number from this drive means anything.
+            If one of them has no scale; see ``scaling.read_scaling``.
         """
-        scale = self.profile.torque
-        if isinstance(scale, str) or isinstance(scale.scale, str):
-            raise NotSupportedError(
-                f"{self.axis}: drive profile {self.profile.name} does not know what the drive's torque "
-                "units are worth (`torque`). Enter it in a profile of your own."
-            )
-        rated = self.read_optional(objects.RATED_TORQUE)
-        if not rated:
-            raise NotSupportedError(
-                f"{self.axis}: motor rated torque 0x6076 is "
-                f"{'missing' if rated is None else 'zero'}, so torques have no scale. Enter the "
-                "motor's data in the drive first."
-            )
-        self._rated_torque = rated * scale.scale
-        counts = self.read_optional(objects.ENCODER_COUNTS) or 0
-        revolutions = self.read_optional(objects.ENCODER_REVOLUTIONS) or 1
-        self._refuse_user_units(counts, revolutions)
-        try:
-            position = position_factor(self._axis.kind, counts, revolutions, self._axis.feed)
-        except ValueError as error:
-            raise NotSupportedError(f"{self.axis}: position has no scale: {error}.") from None
-        self._scaling = AxisScaling(position, position, self._rated_torque / 1000)
-        return self._scaling
+        self._scaled = read_scaling(self)
+        return self._scaled.axis
 
-    def _refuse_user_units(self, counts: int, revolutions: int) -> None:
-        """Refuse a drive whose positions are not those of its motor, while its torques are.
+    def conversion(self) -> Conversion:
+        """Return how parameters become physical, with the quantities read that units depend on.
 
-        A gear (0x6091) or a feed constant (0x6092) puts positions on another side than torques;
-        masses would then be wrong by the ratio, and limits would be those of something else.
+        Raises
+        ------
+        SdoError
+            If the drive does not let them be read.
         """
-        motor = self.read_optional(objects.GEAR_MOTOR) or 1
-        shaft = self.read_optional(objects.GEAR_SHAFT) or 1
-        if motor != shaft:
-            raise NotSupportedError(
-                f"{self.axis}: the drive's gear ratio 0x6091 is {motor}/{shaft}, so its positions are "
-                "those behind the gear and its torques those of the motor. Set it to 1/1 for "
-                "commissioning, and give limits and masses as the motor sees them."
-            )
-        feed = self.read_optional(objects.FEED_CONSTANT)
-        per = self.read_optional(objects.FEED_REVOLUTIONS) or 1
-        if feed and feed * revolutions != counts * per:
-            raise NotSupportedError(
-                f"{self.axis}: the drive's feed constant 0x6092 is {feed}/{per} position units a "
-                f"revolution, its encoder 0x608F has {counts}/{revolutions}. Positions would have two "
-                "scales; set the feed constant to the encoder's increments for commissioning."
-            )
+        quantities = {
+            "counts_per_rev": self.scaled.counts_per_rev,
+            "rated_torque": self.scaled.rated_torque,
+        }
+        for name, info, scale in quantity_objects(self.profile):
+            quantities[name] = float(self.read(info)) * scale
+        return Conversion(self.axis, self.profile, quantities)
 
     def check_limits(self) -> None:
         """Refuse limits that the drive's units can not express: they could not be watched.

@@ -5,7 +5,7 @@ written is in a backup, and whatever fails during a write, all drives get their 
 """
 
 from drives.parameters.backup import Backup, DriveBackup, back_up, load_backup, save_backup
-from drives.parameters.changes import Change, Written, planned_changes, read_parameters
+from drives.parameters.changes import Change, Written, planned_changes, read_loop, read_parameters
 from drives.parameters.restore import check_same_drives, restore
 from drives.parameters.store import store
 from drives.parameters.values import HeldObject, Raw
@@ -23,6 +23,7 @@ __all__ = [
     "check_same_drives",
     "load_backup",
     "planned_changes",
+    "read_loop",
     "read_parameters",
     "restore",
     "save_backup",

@@ -5,10 +5,12 @@ from dataclasses import dataclass
 from math import isfinite
 
 from drives.canopen_drive import CanopenDrive
+from drives.canopen_drive.conversion import Conversion
 from drives.errors import NotSupportedError
 from drives.objects import ObjectInfo
 from drives.parameters.values import Raw
-from drives.profile import ParameterInfo
+from drives.profile import UNKNOWN, ParameterInfo
+from drives.profile.drive import CASCADE_PARAMETERS
 from drives.units import unit_on
 
 COARSEST = 0.02
@@ -44,11 +46,42 @@ class Written:
 
 
 def read_parameters(drive: CanopenDrive) -> dict[str, float]:
-    """Return the drive's controller parameters by name, physical units."""
-    return {
-        name: _number(drive, parameter) * parameter.scale
-        for name, parameter in drive.profile.parameters.items()
-    }
+    """Return the drive's controller parameters by name, physical units.
+
+    Those whose unit the drive's profile does not know are left out.
+    """
+    conversion = drive.conversion()
+    values: dict[str, float] = {}
+    for name, parameter in drive.profile.parameters.items():
+        if conversion.understood(name):
+            values[name] = conversion.physical(name, _number(drive, parameter), values)
+    return values
+
+
+def read_loop(drive: CanopenDrive) -> dict[str, float]:
+    """Return the parameters that tell what the drive does with a target: its cascade's gains, or more.
+
+    Of a drive whose gains can not be read in SI they are those that the machine profile gives
+    (``loop`` of the axis).
+
+    Raises
+    ------
+    NotSupportedError
+        If neither tells them: then nobody knows what a target would do.
+    """
+    conversion = drive.conversion()
+    values = conversion.as_cascade(read_parameters(drive))
+    lacking = [name for name in CASCADE_PARAMETERS if name not in values]
+    if not lacking:
+        return values
+    loop = drive.axis_profile.loop
+    if loop is None:
+        raise NotSupportedError(
+            f"{drive.axis}: {', '.join(lacking)} can not be read from the drive in SI units (drive "
+            f"profile {drive.profile.name}), so nobody knows what a target would do. Read them with the "
+            "maker's software and give them as `loop` at the axis in the machine profile."
+        )
+    return {**values, **loop.model_dump()}
 
 
 def planned_changes(drive: CanopenDrive, wanted: Mapping[str, float]) -> tuple[Change, ...]:
@@ -57,61 +90,112 @@ def planned_changes(drive: CanopenDrive, wanted: Mapping[str, float]) -> tuple[C
     Raises
     ------
     NotSupportedError
-        If the drive has no such parameter, or the value does not fit its range.
+        If the drive has no such parameter, its profile does not know how it is written or what its
+        unit is worth, or the value does not fit its range.
     """
-    unknown = set(wanted) - set(drive.profile.parameters)
+    profile = drive.profile
+    wanted = {k: v for k, v in wanted.items() if k in profile.parameters or not _is_off(k, v)}
+    if wanted and profile.gains_via in NOT_WRITTEN:
+        raise NotSupportedError(
+            f"{drive.axis}: {NOT_WRITTEN[profile.gains_via].format(profile=profile.name)} "
+            f"Enter {', '.join(wanted)} with the maker's software. Nothing was written."
+        )
+    conversion = drive.conversion()
+    held = conversion.as_held(wanted)
+    _check_names(drive, held)
+    changes = []
+    old: dict[str, float] = {}
+    new: dict[str, float] = {}
+    for name, parameter in profile.parameters.items():
+        needed = name in held or any(name in other.times for other in profile.parameters.values())
+        if not needed:
+            continue
+        before = _number(drive, parameter)
+        if name not in held:
+            if conversion.understood(name):
+                old[name] = new[name] = conversion.physical(name, before, old)
+            continue
+        old[name] = conversion.physical(name, before, old)
+        change = _change(drive, conversion, name, float(held[name]), new, before, old[name])
+        new[name] = change.after
+        changes.append(change)
+    return tuple(changes)
+
+
+NOT_WRITTEN = {
+    "interpreter": "the drive's gains are reached only through its own language, not through objects "
+    "(drive profile {profile}).",
+    "none": "drive profile {profile} knows no gains of this drive.",
+    "read-only": "the drive's gains can be read but not written (drive profile {profile}).",
+    "unknown": "drive profile {profile} does not know how the drive's gains are written.",
+}
+"""Ways to gains (``gains_via``) by which this tool writes nothing, in a sentence each."""
+
+
+def _is_off(name: str, value: float) -> bool:
+    """Whether this switches a filter off: done already on a drive that has none."""
+    return name.startswith("filter") and name.endswith("_type") and value == 0
+
+
+def _check_names(drive: CanopenDrive, held: Mapping[str, float]) -> None:
+    parameters = drive.profile.parameters
+    unknown = [name for name in held if name not in parameters]
     if unknown:
         raise NotSupportedError(
             f"{drive.axis}: drive profile {drive.profile.name} has no parameter "
-            f"{', '.join(sorted(unknown))}; it has {', '.join(drive.profile.parameters)}."
+            f"{', '.join(sorted(unknown))}; it has {', '.join(parameters)}."
         )
-    changes = []
-    for name, parameter in drive.profile.parameters.items():
-        if name not in wanted:
-            continue
-        value = float(wanted[name])
-        unit = unit_on(drive.axis_profile.kind, parameter.unit)
-        if not isfinite(value):
+    for name, parameter in parameters.items():
+        if name in held and parameter.write == UNKNOWN:
             raise NotSupportedError(
-                f"{drive.axis}, {name}: {value} is no number that a drive can hold. Design the "
-                "parameters again."
+                f"{drive.axis}, {name}, object {parameter.object}: drive profile {drive.profile.name} "
+                "does not know in which state it may be written (`write`). Nothing was written."
             )
-        low, high = parameter.minimum, parameter.maximum
-        if (low is not None and value < low) or (high is not None and value > high):
+        moved = [other for other in parameter.times if other in held]
+        if moved and name not in held:
             raise NotSupportedError(
-                f"{drive.axis}, {name}: {value:g} {unit} is outside the drive's range "
-                f"{low} to {high} {unit}. Nothing was written."
+                f"{drive.axis}: writing {', '.join(moved)} would change {name} as well, because the "
+                "drive holds one by the other. Write them together. Nothing was written."
             )
-        info = _info(parameter, name)
-        exact = value / parameter.scale
-        raw: Raw = exact if parameter.type.startswith("REAL") else round(exact)
-        try:
-            held = info.decode(info.encode(raw))
-        except ValueError as error:
-            raise NotSupportedError(
-                f"{drive.axis}, {name}, object {parameter.object}: {value:g} {unit} does not fit "
-                f"the drive ({error}). Nothing was written."
-            ) from None
-        if abs(float(held) * parameter.scale - value) > COARSEST * abs(value):
-            raise NotSupportedError(
-                f"{drive.axis}, {name}, object {parameter.object}: the drive holds it in steps of "
-                f"{parameter.scale:g} {unit}, which is too coarse for {value:.3g} {unit}. Nothing was "
-                "written."
-            )
-        before = _number(drive, parameter)
-        changes.append(
-            Change(
-                drive.axis,
-                name,
-                unit,
-                info,
-                before * parameter.scale,
-                float(held) * parameter.scale,
-                before,
-                held,
-            )
+
+
+def _change(
+    drive: CanopenDrive,
+    conversion: Conversion,
+    name: str,
+    value: float,
+    others: Mapping[str, float],
+    before_raw: Raw,
+    before: float,
+) -> Change:
+    parameter = drive.profile.parameters[name]
+    unit = unit_on(drive.axis_profile.kind, parameter.unit)
+    if not isfinite(value):
+        raise NotSupportedError(
+            f"{drive.axis}, {name}: {value} is no number that a drive can hold. Design the "
+            "parameters again."
         )
-    return tuple(changes)
+    low, high = parameter.minimum, parameter.maximum
+    if (low is not None and value < low) or (high is not None and value > high):
+        raise NotSupportedError(
+            f"{drive.axis}, {name}: {value:g} {unit} is outside the drive's range "
+            f"{low} to {high} {unit}. Nothing was written."
+        )
+    info = _info(parameter, name)
+    try:
+        held = info.decode(info.encode(conversion.raw(name, value, others)))
+    except ValueError as error:
+        raise NotSupportedError(
+            f"{drive.axis}, {name}, object {parameter.object}: {value:g} {unit} does not fit "
+            f"the drive ({error}). Nothing was written."
+        ) from None
+    after = conversion.physical(name, held, others)
+    if abs(after - value) > COARSEST * abs(value):
+        raise NotSupportedError(
+            f"{drive.axis}, {name}, object {parameter.object}: the drive would hold {after:.3g} "
+            f"{unit} for {value:.3g} {unit}; its steps are too coarse. Nothing was written."
+        )
+    return Change(drive.axis, name, unit, info, before, after, before_raw, held)
 
 
 def _info(parameter: ParameterInfo, name: str) -> ObjectInfo:

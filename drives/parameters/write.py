@@ -56,7 +56,7 @@ def _read_back(drive: CanopenDrive, change: Change) -> Written:
             f"{change.axis}, {change.name}, object {change.info.address}: wrote {change.after_raw}, "
             f"the drive holds {found}."
         )
-    return Written(change, float(found) * drive.profile.parameters[change.name].scale)
+    return Written(change, change.after)
 
 
 class _MismatchError(DrivesError):

@@ -3,7 +3,7 @@
 import numpy as np
 
 from drives.canopen_drive import CanopenGroup
-from drives.parameters import read_parameters
+from drives.parameters import read_loop
 from drives.profile import MachineProfile
 from fieldtool.experiment.axes import Axes
 from fieldtool.experiment.forecast import Setting
@@ -18,7 +18,7 @@ def setting_of(machine: MachineProfile, group: CanopenGroup, model: MachineModel
     """Return model, loops as they are in the drives now, limits, and centres."""
     return Setting(
         model,
-        tuple(loop_from_parameters(read_parameters(drive)) for drive in group.drives),
+        tuple(loop_from_parameters(read_loop(drive)) for drive in group.drives),
         tuple(drive.limits for drive in group.drives),
         np.array([sum(axis.limits.travel) / 2 for axis in machine.axes]),
     )
@@ -33,7 +33,7 @@ def recording_header(
     """
     axes = []
     for axis, drive in zip(machine.axes, group.drives, strict=True):
-        values = read_parameters(drive)
+        values = read_loop(drive)
         rotary = axis.kind == "rotary"
         axes.append(
             AxisInfo(
@@ -58,7 +58,7 @@ def recording_header(
         f"{d.axis}={d.profile.torque_lag!r}"
         for d in group.drives
         if d.profile.interpolation == "linear"
-        and not smooth(loop_from_parameters(read_parameters(d)), 2 * np.pi / cycle_time)
+        and not smooth(loop_from_parameters(read_loop(d)), 2 * np.pi / cycle_time)
     ]
     if linear:
         source[LINEAR_TARGETS] = " ".join(linear)
