@@ -5,18 +5,17 @@ to identify; 6 write-back failed and was restored; 7 write-back failed and could
 stopped by the user, machine safe.
 """
 
-import json
 import signal
 import sys
 import tempfile
 import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
 from time import monotonic
 from types import FrameType
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 from rich.console import Console
@@ -37,6 +36,8 @@ from drives.parameters import Change
 from drives.profile import MachineProfile
 from fieldtool import workflow
 from fieldtool.cli.bus_options import Bitrate, Channel, Interface, on_bus
+from fieldtool.cli.output import console_of, print_json
+from fieldtool.cli.scan import scan
 from fieldtool.cli.screen import (
     TerminalScreen,
     model_table,
@@ -173,11 +174,6 @@ def _stop_key() -> Iterator[_StopKey]:
         signal.signal(signal.SIGTERM, before_term)
 
 
-def _console(as_json: bool) -> Console:
-    console = Console(stderr=as_json, highlight=False)
-    return console if console.is_terminal else Console(stderr=as_json, highlight=False, width=120)
-
-
 def _folder(out: Path | None, name: str) -> Path:
     if out is not None:
         return out
@@ -237,10 +233,6 @@ def _may_move(yes: bool) -> Callable[[str], bool] | None:
     return lambda sentence: typer.confirm(f"{sentence}\nMove the machine now?", err=True)
 
 
-def _print_json(data: Mapping[str, Any]) -> None:
-    sys.stdout.write(json.dumps(data, indent=2, allow_nan=False) + "\n")
-
-
 @app.command()
 def run(
     machine: Machine,
@@ -265,7 +257,7 @@ def run(
     folder = _folder(out, machine)
     traced = trace_path(trace, trace_file, folder)
     options = _options(plan, write, store, motor_inertia, seconds, traced)
-    console = _console(as_json)
+    console = console_of(as_json)
     if plan_only:
         profile = on_bus(machine, interface, channel, bitrate)
         _show_plan(profile, options, console, as_json)
@@ -281,7 +273,7 @@ def run(
         )
     show_result(console, result)
     if as_json:
-        _print_json(result.as_dict())
+        print_json(result.as_dict())
 
 
 @app.command()
@@ -335,7 +327,7 @@ def measure(
     folder = _folder(out, machine)
     traced = trace_path(trace, trace_file, folder)
     options = _options(plan, False, False, "measured", seconds, traced)
-    console = _console(as_json)
+    console = console_of(as_json)
     if plan_only:
         profile = on_bus(machine, interface, channel, bitrate)
         _show_plan(profile, options, console, as_json)
@@ -350,7 +342,7 @@ def measure(
         )
     console.print(f"{seconds:.0f} s of machine time; the recording is in {folder}")
     if as_json:
-        _print_json({"folder": str(folder), "time": {"machine_s": seconds}})
+        print_json({"folder": str(folder), "time": {"machine_s": seconds}})
 
 
 def _show_plan(
@@ -362,7 +354,7 @@ def _show_plan(
     with TerminalScreen(console) as screen:
         planned = workflow.plan(machine, options, screen=screen)
     if as_json:
-        _print_json(planned.as_dict())
+        print_json(planned.as_dict())
 
 
 @app.command()
@@ -384,7 +376,7 @@ def identify(
     as_json: Json = False,
 ) -> None:
     """Identify masses, springs, couplings and dampers from a recording."""
-    console = _console(as_json)
+    console = console_of(as_json)
     options = _options("fast", False, False, motor_inertia, seconds)
     planned = None
     if plan_only:
@@ -405,7 +397,7 @@ def identify(
             screen.fast_plan(planned)
     if as_json:
         data = {"model": found.model.as_dict(), "notes": list(found.notes)}
-        _print_json({**data, "plan": planned.as_dict()} if planned is not None else data)
+        print_json({**data, "plan": planned.as_dict()} if planned is not None else data)
 
 
 @app.command()
@@ -419,7 +411,7 @@ def compare(
     as_json: Json = False,
 ) -> None:
     """Predict a signal that no fit has seen (the load side), and print the error."""
-    console = _console(as_json)
+    console = console_of(as_json)
     comparisons = workflow.compare(recording, model, (low, high))
     for c in comparisons:
         console.print(
@@ -428,7 +420,7 @@ def compare(
             f"{c.median_degrees:.2f} degrees."
         )
     if as_json:
-        _print_json(
+        print_json(
             {
                 "comparisons": [
                     {
@@ -447,7 +439,7 @@ def compare(
 def design(folder: Annotated[Path, typer.Argument(help="Session folder.")]) -> None:
     """Design controller parameters from the session folder's model."""
     tuning = workflow.redesign(folder)
-    console = _console(False)
+    console = console_of(False)
     for axis in tuning.axes:
         console.print(
             f"{axis.axis}: {axis.reason} Peak of sensitivity {axis.sensitivity_peak:.2f} (2 or less is "
@@ -470,7 +462,7 @@ def write(
     trace_file: TraceFile = None,
 ) -> None:
     """Write the session folder's tuning into the drives: backup, write, read back."""
-    console = _console(False)
+    console = console_of(False)
     traced = trace_path(trace, trace_file, folder)
     options = workflow.Options(write=True, store=store, trace=traced)
     with _stop_key() as key, TerminalScreen(console) as screen:
@@ -504,7 +496,7 @@ def restore(
     with _stop_key():
         profile = on_bus(machine, interface, channel, bitrate)
         written = workflow.restore(profile, backup, store, traced)
-    console = _console(False)
+    console = console_of(False)
     console.print(f"{len(written)} parameters differed and were restored; all were read back.")
     console.print(
         "They are stored too: they survive a power cycle."
@@ -522,7 +514,7 @@ def import_(
     """Turn a folder with recording.yaml and CSV files into a recording."""
     recording = workflow.import_folder(folder, out)
     rows = sum(e.samples for e in recording.experiments)
-    _console(False).print(f"{out}: {len(recording.experiments)} experiments, {rows} rows.")
+    console_of(False).print(f"{out}: {len(recording.experiments)} experiments, {rows} rows.")
 
 
 @app.command()
@@ -532,7 +524,7 @@ def export(
 ) -> None:
     """Turn a recording into a folder with recording.yaml and CSV files."""
     workflow.export_folder(recording, folder)
-    _console(False).print(f"{folder} written.")
+    console_of(False).print(f"{folder} written.")
 
 
 @app.command()
@@ -543,11 +535,14 @@ def simulate(
     bitrate: Bitrate = None,
 ) -> None:
     """Serve the simulated machine's nodes in real time on a bus, until Ctrl-C."""
-    console = _console(False)
+    console = console_of(False)
     with _stop_key() as key:
         profile = on_bus(machine, interface, channel, bitrate)
         served = workflow.simulate(profile, key, console.print)
     console.print(served)
+
+
+app.command()(scan)
 
 
 def _lengths(masses: Sequence[str]) -> dict[str, int]:
