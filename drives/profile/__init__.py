@@ -11,6 +11,7 @@ Files are looked for as given, else among the packaged ones (``profiles/drives``
 from drives.profile.bus import BusProfile
 from drives.profile.chain import ChainProfile, CouplingProfile
 from drives.profile.drive import DriveProfile, Identity
+from drives.profile.effects import EffectProfile, MachineEffectProfile
 from drives.profile.loading import load_drive, load_machine, packaged
 from drives.profile.machine import (
     AxisProfile,
@@ -21,12 +22,7 @@ from drives.profile.machine import (
 )
 from drives.profile.parameter import FilterInfo, Latch, ParameterInfo, Store, Unlock
 from drives.profile.scales import PositionScale, Quantity, SyncRules, TorqueScale
-from drives.profile.simulation import (
-    CoulombFrictionProfile,
-    EffectProfile,
-    SimulatedAxisProfile,
-    SimulationProfile,
-)
+from drives.profile.simulation import SimulatedAxisProfile, SimulationProfile
 from drives.profile.values import DIMENSIONS, UNKNOWN, known
 from drives.profile.yaml_reader import MAX_PROFILE_BYTES, read_yaml
 
@@ -37,7 +33,6 @@ __all__ = [
     "AxisProfile",
     "BusProfile",
     "ChainProfile",
-    "CoulombFrictionProfile",
     "CouplingProfile",
     "DriveProfile",
     "EffectProfile",
@@ -46,6 +41,7 @@ __all__ = [
     "Latch",
     "Limits",
     "LoopProfile",
+    "MachineEffectProfile",
     "MachineProfile",
     "MotorInertia",
     "ParameterInfo",

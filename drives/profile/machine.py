@@ -145,9 +145,11 @@ class MachineProfile(Part):
                         f"axes {other.name} and {axis.name} both have node id {axis.node_id}; "
                         "each drive on the bus needs its own",
                     )
+        simulated = self.simulation
         for where, couplings in (
             (("couplings",), self.couplings),
-            (("simulation", "couplings"), self.simulation.couplings if self.simulation else ()),
+            (("simulation", "couplings"), simulated.couplings if simulated else ()),
+            (("simulation", "effects"), simulated.effects if simulated else ()),
         ):
             for k, coupling in enumerate(couplings):
                 a, b = coupling.axes

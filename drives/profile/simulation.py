@@ -1,24 +1,12 @@
 """What stands behind a simulated machine: the truth that the tool itself never looks at."""
 
-from typing import Annotated, Literal
+from typing import Annotated
 
 from pydantic import Field, model_validator
 
 from drives.profile.chain import ChainProfile, CouplingProfile
-from drives.profile.values import NotNegative, Number, Part, Positive
-
-
-class CoulombFrictionProfile(Part):
-    """Dry friction between a chain's first (motor) or last (load) mass and ground."""
-
-    effect: Literal["coulomb_friction"]
-    location: Literal["motor", "load"] = "motor"
-    torque: NotNegative
-    """N m, or N on a linear axis; the same at standstill as while sliding."""
-
-
-EffectProfile = CoulombFrictionProfile
-"""One part of a simulated axis; a union of such classes, told apart by ``effect``."""
+from drives.profile.effects import EffectProfile, MachineEffectProfile
+from drives.profile.values import LocatedError, NotNegative, Number, Part, Positive
 
 
 class SimulatedAxisProfile(Part):
@@ -29,7 +17,7 @@ class SimulatedAxisProfile(Part):
     dampers: tuple[NotNegative, ...] = ()
     viscous_friction: NotNegative = 0.0
     effects: tuple[Annotated[EffectProfile, Field(discriminator="effect")], ...] = ()
-    """What makes the axis non-linear, with the names of ``model.yaml``."""
+    """What else acts, with the names of ``model.yaml``."""
     rated_torque: Positive
     peak_torque: Positive
     torque_noise: NotNegative = 0.0
@@ -40,6 +28,13 @@ class SimulatedAxisProfile(Part):
     @model_validator(mode="after")
     def _chain(self) -> "SimulatedAxisProfile":
         ChainProfile(masses=self.masses, springs=self.springs, dampers=self.dampers)
+        for k, part in enumerate(self.effects):
+            joint = getattr(part, "joint", 1)
+            if hasattr(part, "joint") and joint > len(self.springs):
+                raise LocatedError(
+                    ("effects", k),
+                    f"joint {joint} does not exist: this axis has {len(self.springs)} springs",
+                )
         return self
 
 
@@ -48,4 +43,6 @@ class SimulationProfile(Part):
 
     axes: tuple[SimulatedAxisProfile, ...]
     couplings: tuple[CouplingProfile, ...] = ()
+    effects: tuple[Annotated[MachineEffectProfile, Field(discriminator="effect")], ...] = ()
+    """What else joins axes."""
     seed: Annotated[int, Field(ge=0)] = 0

@@ -7,14 +7,36 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Literal
 
 from drives.sim.dictionary import Key, Value
-from drives.sim.effects import ChainEffect, CoulombFriction
+from drives.sim.effects import (
+    AsymmetricFriction,
+    Backlash,
+    ChainEffect,
+    Cogging,
+    CoulombFriction,
+    CouplingInertia,
+    CouplingSpring,
+    EncoderError,
+    ExtraMode,
+    Gravity,
+    HardeningSpring,
+    MachineEffect,
+    MeasurementDelay,
+    PeriodicDisturbance,
+    SofteningSpring,
+    StiffnessChange,
+    StribeckFriction,
+    StructuralDamping,
+    TorqueLag,
+    TorqueSaturation,
+    TorqueScale,
+)
 from drives.sim.entries import ENTRIES
 from drives.sim.firmware import DriveHardware
 from drives.sim.plant import ChainParameters, PlantParameters
 from drives.sim.scales import Scales, gain_objects
 
 if TYPE_CHECKING:
-    from drives.profile import EffectProfile, MachineProfile
+    from drives.profile import EffectProfile, MachineEffectProfile, MachineProfile
 
 Kind = Literal["rotary", "linear"]
 
@@ -149,6 +171,8 @@ class SimulatedMachine:
     """(a, b, value): inertia coupling between the last masses of drives a and b, from 0."""
     seed: int = 0
     """Of the measurement noise."""
+    effects: tuple[MachineEffect, ...] = ()
+    """What else joins the drives' chains."""
 
     def __post_init__(self) -> None:
         for what in ("name", "node_id"):
@@ -160,7 +184,8 @@ class SimulatedMachine:
     @property
     def plant(self) -> PlantParameters:
         """The mechanics of all drives."""
-        return PlantParameters(tuple(drive.chain for drive in self.drives), self.couplings)
+        chains = tuple(drive.chain for drive in self.drives)
+        return PlantParameters(chains, self.couplings, self.effects)
 
 
 def simulated_machine(profile: "MachineProfile") -> SimulatedMachine:
@@ -203,7 +228,7 @@ def simulated_machine(profile: "MachineProfile") -> SimulatedMachine:
                     springs=truth.springs,
                     dampers=truth.dampers or (0.0,) * len(truth.springs),
                     viscous_friction=truth.viscous_friction,
-                    effects=tuple(_effect(part) for part in truth.effects),
+                    effects=tuple(chain_effect(part, axis.kind) for part in truth.effects),
                 ),
                 rated_torque=truth.rated_torque,
                 peak_torque=truth.peak_torque,
@@ -217,10 +242,44 @@ def simulated_machine(profile: "MachineProfile") -> SimulatedMachine:
     couplings = tuple(
         (names.index(c.axes[0]), names.index(c.axes[1]), c.value) for c in simulation.couplings
     )
-    return SimulatedMachine(tuple(drives), couplings, simulation.seed)
+    effects = tuple(_machine_effect(part, names) for part in simulation.effects)
+    return SimulatedMachine(tuple(drives), couplings, simulation.seed, effects)
 
 
-def _effect(part: "EffectProfile") -> ChainEffect:
-    match part.effect:
-        case "coulomb_friction":
-            return CoulombFriction(part.torque, part.location)
+_PARTS: dict[str, type[ChainEffect]] = {
+    "coulomb_friction": CoulombFriction,
+    "stribeck_friction": StribeckFriction,
+    "asymmetric_friction": AsymmetricFriction,
+    "backlash": Backlash,
+    "hardening_spring": HardeningSpring,
+    "softening_spring": SofteningSpring,
+    "structural_damping": StructuralDamping,
+    "stiffness_change": StiffnessChange,
+    "gravity": Gravity,
+    "cogging": Cogging,
+    "periodic_disturbance": PeriodicDisturbance,
+    "extra_mode": ExtraMode,
+    "torque_scale": TorqueScale,
+    "torque_saturation": TorqueSaturation,
+    "torque_lag": TorqueLag,
+    "measurement_delay": MeasurementDelay,
+    "encoder_error": EncoderError,
+}
+"""Parts of a chain by the names of ``model.yaml``; their fields are those of the profile."""
+
+
+def chain_effect(part: "EffectProfile", kind: Kind) -> ChainEffect:
+    """Return the part that a profile describes, for an axis of this kind."""
+    values = part.model_dump(exclude={"effect"})
+    if kind == "linear" and part.effect == "gravity":
+        values["angle"] = None
+    if kind == "linear" and part.effect in ("cogging", "encoder_error"):
+        values["linear"] = True
+    return _PARTS[part.effect](**values)
+
+
+def _machine_effect(part: "MachineEffectProfile", names: list[str]) -> MachineEffect:
+    chains = (names.index(part.axes[0]), names.index(part.axes[1]))
+    if part.effect == "coupling_spring":
+        return CouplingSpring(chains, part.spring, part.damper, part.location)
+    return CouplingInertia(chains, part.inertia, part.location)

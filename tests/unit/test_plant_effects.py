@@ -1,12 +1,18 @@
 """Every effect of the simulated machine against another integrator, a law or a known answer."""
 
-from dataclasses import replace
+import json
+import re
+from dataclasses import asdict, replace
+from importlib.resources import files
 from math import pi
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from drives.errors import ProfileError
+from drives.profile import load_machine
 from drives.sim.effects import (
     AsymmetricFriction,
     Backlash,
@@ -30,6 +36,7 @@ from drives.sim.effects import (
     TorqueScale,
 )
 from drives.sim.firmware import DriveHardware, Parameter, SimulatedAxes
+from drives.sim.machine import simulated_machine
 from drives.sim.plant import ChainParameters, Plant, PlantParameters
 
 RATE = 8000
@@ -351,3 +358,73 @@ def test_parts_that_can_not_be_are_refused() -> None:
     ):
         with pytest.raises(ValueError, match=words):
             build()
+
+
+# -- where it is said ---------------------------------------------------------------------------------
+
+
+def profile_text(axis_effects: str, machine_effects: str = "[]") -> str:
+    text = files("profiles").joinpath("machines", "turntable-arm.yaml").read_text("utf-8")
+    text = text.replace("  seed: 7\n", f"  seed: 7\n  effects: {machine_effects}\n")
+    first = "    - masses: [0.02, 0.03]\n"
+    return text.replace(first, f"{first}      effects: {axis_effects}\n")
+
+
+def test_a_profile_names_every_effect(tmp_path: Path) -> None:
+    wanted = (
+        StribeckFriction(0.4, 0.6, 0.1, "load"),
+        AsymmetricFriction(0.3, 0.2),
+        Backlash(0.01, 1, 0.5),
+        HardeningSpring(0.1),
+        SofteningSpring(0.2),
+        StructuralDamping(0.05),
+        StiffnessChange(0.7, 3.0),
+        Gravity(2.0, 0.3),
+        Cogging(0.1, 12.0),
+        PeriodicDisturbance(0.1, 7.0),
+        ExtraMode(0.01, 20.0),
+        TorqueScale(0.9),
+        TorqueSaturation(3.0),
+        TorqueLag(0.001),
+        MeasurementDelay(0.002),
+        EncoderError(0.001, 16.0),
+    )
+    parts = []
+    for effect in wanted:
+        words = re.sub(r"(?<!^)(?=[A-Z])", "_", type(effect).__name__).lower()
+        fields = {k: v for k, v in asdict(effect).items() if k not in ("brake", "band", "linear")}
+        parts.append({"effect": words, **fields})
+    between = [
+        {"effect": "coupling_spring", "axes": ["table", "arm"], "spring": 5.0},
+        {"effect": "coupling_inertia", "axes": ["arm", "table"], "inertia": 0.001},
+    ]
+    path = tmp_path / "machine.yaml"
+    path.write_text(profile_text(json.dumps(parts), json.dumps(between)))
+    machine = simulated_machine(load_machine(path))
+    assert machine.drives[0].chain.effects == wanted
+    assert machine.effects == (CouplingSpring((0, 1), 5.0), CouplingInertia((1, 0), 0.001))
+    assert Plant(machine.plant).size == 4
+
+
+@pytest.mark.parametrize(
+    ("axis", "between", "message"),
+    [
+        ("[{effect: backlash, joint: 2, play: 0.1}]", "[]", "joint 2 does not exist"),
+        (
+            "[{effect: stribeck_friction, torque: 1, breakaway: 0.5, velocity: 1}]",
+            "[]",
+            "breakaway",
+        ),
+        ("[{effect: encoder_error, amplitude: 0.2, periods: 16}]", "[]", "1/periods"),
+        ("[]", "[{effect: coupling_spring, axes: [table, leg], spring: 5}]", "table - leg"),
+        ("[]", "[{effect: backlash, play: 5}]", "coupling_spring"),
+    ],
+)
+def test_an_effect_that_can_not_be_is_refused_with_its_line(
+    axis: str, between: str, message: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "machine.yaml"
+    path.write_text(profile_text(axis, between))
+    with pytest.raises(ProfileError, match=message) as caught:
+        load_machine(path)
+    assert caught.value.line is not None
