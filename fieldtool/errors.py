@@ -5,6 +5,7 @@
     FieldtoolError
     ├── FileFormatError          a file is not what it should be (file, line, column, what to do)
     ├── OutputError              a folder or file can not be written
+    ├── UnfinishedWriteError     a write-back was cut off and has to be taken back first
     ├── PlanRefusedError         the experiment would leave a limit, or nothing safe is possible
     └── IdentificationError      the data do not allow the answer
         ├── LoopUnstableError    a position loop became unstable while it was measured
@@ -33,6 +34,10 @@ class FileFormatError(FieldtoolError):
 
 class OutputError(FieldtoolError):
     """A result can not be written: disk full, no such folder, no permission."""
+
+
+class UnfinishedWriteError(FieldtoolError):
+    """A write-back into these drives was cut off; nothing else may be done before it is taken back."""
 
 
 class PlanRefusedError(FieldtoolError):

@@ -46,6 +46,14 @@ def _random_model(
     return MachineModel(tuple(chains), tuple(couplings))
 
 
+@pytest.fixture(autouse=True)
+def _notes_elsewhere(
+    monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    """Keep notes about unfinished writes out of the user's own state folder."""
+    monkeypatch.setenv("FIELDTOOL_STATE_DIR", str(tmp_path_factory.mktemp("notes")))
+
+
 @pytest.fixture(scope="session")
 def random_model() -> RandomModel:
     """Makes ``random_model(rng, lengths, damped=True, friction=False)``."""

@@ -275,6 +275,10 @@ class CanopenDrive:
                 "node id and the bit rate."
             ) from None
 
+    def wait(self, seconds: float) -> None:
+        """Let time pass on the drive's bus, and receive meanwhile."""
+        self.line.wait(seconds)
+
     def answers(self) -> bool:
         """Whether the node answers at all."""
         try:

@@ -256,6 +256,8 @@ def connect(
     bus: can.BusABC | None = None,
     stop_requested: Callable[[], bool] = _never,
     trace: Path | None = None,
+    *,
+    to_move: bool = True,
 ) -> Iterator[CanopenGroup]:
     """Open the machine's bus, and identify every drive on it; nothing moves and nothing is written.
 
@@ -269,6 +271,9 @@ def connect(
         Asked in every cycle of a motion: whether the user wants to stop.
     trace
         File that every frame is noted in (``drives.trace``); none where it is None.
+    to_move
+        Refuse drives that could not be moved: in fault, without scales, or whose scales do not fit
+        the limits.  A drive that has lost its parameters is such a one, until they are restored.
 
     Raises
     ------
@@ -295,7 +300,7 @@ def connect(
         for drive in drives:
             drive.identify()
         _check_alone(line, drives)
-        for drive in drives:
+        for drive in drives if to_move else ():
             drive.check_idle()
             drive.read_scaling()
             drive.check_limits()

@@ -1,32 +1,49 @@
 """Controller parameters: back up, compare, write in order, read back, restore, store.
 
 Nothing here writes to a drive that is enabled.  Before the first write everything that could be
-written is in a backup, and whatever fails during a write, all drives get their old values back.
+written is in a backup, and the journal of the write is on the disk; whatever fails during a write,
+all drives get their old values back, now or by whoever reads the journal next.
 """
 
 from drives.parameters.backup import Backup, DriveBackup, back_up, load_backup, save_backup
+from drives.parameters.bring_back import Found
 from drives.parameters.changes import Change, Written, planned_changes, read_loop, read_parameters
-from drives.parameters.restore import check_same_drives, restore
-from drives.parameters.store import store
-from drives.parameters.values import HeldObject, Raw
-from drives.parameters.write import check_disabled, write
+from drives.parameters.guard import check_disabled, check_objects, check_same_drives
+from drives.parameters.journal import DriveRecord, Journal, JournalEntry, Memory, Phase, Storing
+from drives.parameters.journal_file import load_journal, save_journal
+from drives.parameters.outcome import MEMORY_WORDS, DriveOutcome
+from drives.parameters.store import check_can_store
+from drives.parameters.transaction import Transaction
+from drives.parameters.values import HeldObject, Raw, same
 
 __all__ = [
+    "MEMORY_WORDS",
     "Backup",
     "Change",
     "DriveBackup",
+    "DriveOutcome",
+    "DriveRecord",
+    "Found",
     "HeldObject",
+    "Journal",
+    "JournalEntry",
+    "Memory",
+    "Phase",
     "Raw",
+    "Storing",
+    "Transaction",
     "Written",
     "back_up",
+    "check_can_store",
     "check_disabled",
+    "check_objects",
     "check_same_drives",
     "load_backup",
+    "load_journal",
     "planned_changes",
     "read_loop",
     "read_parameters",
-    "restore",
+    "same",
     "save_backup",
-    "store",
-    "write",
+    "save_journal",
 ]

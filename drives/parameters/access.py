@@ -2,15 +2,15 @@
 
 from collections.abc import Iterable
 
-from drives.canopen_drive import CanopenDrive
 from drives.errors import DrivesError, NotSupportedError
 from drives.objects import ObjectAddress, ObjectInfo
+from drives.parameters.values import ParameterDrive
 
 NOBODY = 0
 """User level of a drive that is locked."""
 
 
-def unlock(drive: CanopenDrive) -> None:
+def unlock(drive: ParameterDrive) -> None:
     """Give the drive its password, where its profile says that it wants one; the drive forgets it.
 
     Raises
@@ -43,7 +43,7 @@ def unlock(drive: CanopenDrive) -> None:
         )
 
 
-def _level(drive: CanopenDrive) -> int | None:
+def _level(drive: ParameterDrive) -> int | None:
     how = drive.profile.unlock
     if how is None or how.level is None:
         return None
@@ -56,7 +56,7 @@ def _kind(error: DrivesError) -> str:
     return f"abort code 0x{code:08X}" if isinstance(code, int) else type(error).__name__
 
 
-def take_over(drive: CanopenDrive, written: Iterable[ObjectAddress]) -> None:
+def take_over(drive: ParameterDrive, written: Iterable[ObjectAddress]) -> None:
     """Tell the drive to use what was written, where its profile names a latch for it.
 
     Raises

@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -14,7 +13,8 @@ import yaml
 from drives.canopen_drive import CanopenDrive
 from drives.errors import ProfileError, SdoAbortError
 from drives.objects import DATA_TYPES, ObjectAddress, ObjectInfo
-from drives.parameters.values import HeldObject
+from drives.parameters.durable import write_durably
+from drives.parameters.values import HeldObject, checked_value
 from drives.profile import read_yaml
 
 FORMAT = "fieldtool-parameters/1"
@@ -32,6 +32,9 @@ class DriveBackup:
     vendor_id: int
     product_code: int
     serial_number: int
+    """0 where the drive has none."""
+    revision_number: int
+    """0 where the drive has none, or the backup does not say."""
     held: tuple[HeldObject, ...]
 
 
@@ -71,6 +74,7 @@ def back_up(machine: str, drives: Iterable[CanopenDrive]) -> Backup:
                 identity.vendor_id,
                 identity.product_code,
                 identity.serial_number,
+                identity.revision,
                 tuple(held),
             )
         )
@@ -100,20 +104,16 @@ def save_backup(backup: Backup, path: Path) -> None:
         "format": FORMAT,
         "machine": backup.machine,
         "taken": backup.taken,
-        "checksum": _checksum(parts),
+        "checksum": checksum(parts),
         "drives": parts,
     }
-    temporary = path.with_name(path.name + ".part")
-    try:
-        with temporary.open("w", encoding="utf-8") as file:
-            yaml.dump(data, file, Dumper=_DUMPER, sort_keys=False, width=120)
-            file.flush()
-            os.fsync(file.fileno())
-        if load_backup(temporary) != backup:
+    text = yaml.dump(data, Dumper=_DUMPER, sort_keys=False, width=120)
+
+    def check(written: Path) -> None:
+        if load_backup(written) != backup:
             raise ProfileError(path, "the backup is not read back as it was written")
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+
+    write_durably(path, text.encode(), check)
 
 
 def _drive_as_dict(drive: DriveBackup) -> dict[str, Any]:
@@ -123,6 +123,7 @@ def _drive_as_dict(drive: DriveBackup) -> dict[str, Any]:
         "vendor_id": drive.vendor_id,
         "product_code": drive.product_code,
         "serial_number": drive.serial_number,
+        "revision_number": drive.revision_number,
         "objects": [
             {
                 "object": str(held.info.address),
@@ -135,8 +136,8 @@ def _drive_as_dict(drive: DriveBackup) -> dict[str, Any]:
     }
 
 
-def _checksum(parts: Any) -> str:
-    """Return the SHA-256 of the drives' part of a backup, in one spelling of its values."""
+def checksum(parts: Any) -> str:
+    """Return the SHA-256 of plain values, in one spelling of them."""
     text = json.dumps(parts, sort_keys=True, default=str)
     return hashlib.sha256(text.encode()).hexdigest()
 
@@ -157,15 +158,13 @@ def load_backup(path: Path) -> Backup:
         backup = Backup(
             str(data["machine"]),
             str(data["taken"]),
-            tuple(
-                _drive_backup(drive, k, place) for k, drive in enumerate(_listed(data["drives"]))
-            ),
+            tuple(_drive_backup(drive, k, place) for k, drive in enumerate(listed(data["drives"]))),
         )
     except (KeyError, TypeError, AttributeError, ValueError, ArithmeticError) as error:
         what = f"key {error} is missing" if isinstance(error, KeyError) else str(error)
         line = lines.get(tuple(place), 1)
         raise ProfileError(path, f"is no parameter backup: {what}", line) from None
-    if data.get("checksum") != _checksum(data["drives"]):
+    if data.get("checksum") != checksum(data["drives"]):
         raise ProfileError(
             path,
             "is not whole: its checksum does not fit what stands in it. It was cut short or changed; "
@@ -175,7 +174,15 @@ def load_backup(path: Path) -> Backup:
     return backup
 
 
-def _listed(value: Any) -> list[Any]:
+def whole(value: Any, highest: int = 2**32 - 1) -> int:
+    """Return a value of a file that must be a whole number from 0; raise ValueError if it is none."""
+    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= highest:
+        raise ValueError(f"a whole number from 0 to {highest} was expected, got {value!r}")
+    return value
+
+
+def listed(value: Any) -> list[Any]:
+    """Return a value of a file that must be a list; raise TypeError if it is none."""
     if not isinstance(value, list):
         raise TypeError(f"a list was expected, got {value!r}")
     return value
@@ -184,7 +191,7 @@ def _listed(value: Any) -> list[Any]:
 def _drive_backup(drive: Mapping[str, Any], k: int, place: list[str | int]) -> DriveBackup:
     place[:] = ["drives", k]
     held: dict[ObjectAddress, HeldObject] = {}
-    for j, item in enumerate(_listed(drive["objects"])):
+    for j, item in enumerate(listed(drive["objects"])):
         place[:] = ["drives", k, "objects", j]
         one = _held(item)
         if one.info.address in held:
@@ -193,10 +200,11 @@ def _drive_backup(drive: Mapping[str, Any], k: int, place: list[str | int]) -> D
     place[:] = ["drives", k]
     return DriveBackup(
         str(drive["axis"]),
-        int(drive["node_id"]),
-        int(drive["vendor_id"]),
-        int(drive["product_code"]),
-        int(drive["serial_number"]),
+        whole(drive["node_id"], 127),
+        whole(drive["vendor_id"]),
+        whole(drive["product_code"]),
+        whole(drive["serial_number"]),
+        whole(drive.get("revision_number", 0)),
         tuple(held.values()),
     )
 
@@ -205,5 +213,4 @@ def _held(item: Mapping[str, Any]) -> HeldObject:
     if item["type"] not in DATA_TYPES:
         raise ValueError(f"unknown type {item['type']!r}")
     info = ObjectInfo(ObjectAddress.parse(item["object"]), item["type"], str(item["name"]))
-    info.encode(item["value"])
-    return HeldObject(info, item["value"])
+    return HeldObject(info, checked_value(info, item["value"]))

@@ -7,8 +7,9 @@ from math import isfinite
 from drives.canopen_drive import CanopenDrive
 from drives.canopen_drive.conversion import Conversion
 from drives.errors import NotSupportedError
-from drives.objects import ObjectInfo
-from drives.parameters.values import Raw
+from drives.objects import COMMANDS, ObjectInfo
+from drives.parameters.guard import parameter_types
+from drives.parameters.values import Raw, same
 from drives.profile import UNKNOWN, ParameterInfo
 from drives.profile.drive import CASCADE_PARAMETERS
 from drives.units import unit_on
@@ -34,7 +35,7 @@ class Change:
     @property
     def differs(self) -> bool:
         """Whether there is anything to write."""
-        return self.before_raw != self.after_raw
+        return not same(self.info, self.before_raw, self.after_raw)
 
 
 @dataclass(frozen=True)
@@ -145,7 +146,16 @@ def _check_names(drive: CanopenDrive, held: Mapping[str, float]) -> None:
             f"{drive.axis}: drive profile {drive.profile.name} has no parameter "
             f"{', '.join(sorted(unknown))}; it has {', '.join(parameters)}."
         )
+    types = parameter_types(drive)
     for name, parameter in parameters.items():
+        known = types.get(parameter.object, parameter.type)
+        if name in held and (parameter.object.index in COMMANDS or known != parameter.type):
+            what = "a command" if parameter.object.index in COMMANDS else f"{known} in its EDS"
+            raise NotSupportedError(
+                f"{drive.axis}, {name}, object {parameter.object}: is {what}, drive profile "
+                f"{drive.profile.name} says a parameter of {parameter.type}. Correct the profile. "
+                "Nothing was written."
+            )
         if name in held and parameter.write == UNKNOWN:
             raise NotSupportedError(
                 f"{drive.axis}, {name}, object {parameter.object}: drive profile {drive.profile.name} "

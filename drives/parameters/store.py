@@ -1,63 +1,75 @@
-"""Store parameters in the drives' non-volatile memory (0x1010)."""
+"""Store one drive's parameters in its non-volatile memory (0x1010), and know how that ended."""
 
-from collections.abc import Sequence
-
-from drives.canopen_drive import CanopenDrive
-from drives.canopen_drive.interrupts import uninterrupted
-from drives.errors import DrivesError, NotSupportedError, StoppedError, WriteBackMixedError
-from drives.objects import ObjectInfo
+from drives.errors import DrivesError, NotSupportedError, SdoAbortError, SdoTimeoutError
+from drives.objects import ObjectAddress, ObjectInfo
+from drives.parameters.values import ParameterDrive
 from drives.profile import Store
 
-SAVE_SIGNATURE = int.from_bytes(b"save", "little")
+NOT_BEGUN = (0x0503, 0x0504, 0x0601, 0x0602, 0x0607, 0x0609, 0x0800)
+"""Upper halves of the abort codes with which a drive refuses to store.  CiA 301, object 0x1010: a
+drive that refuses answers 0x0800002x, one whose storing failed answers 0x06060000 (hardware)."""
+POLLING = 0.02
+"""Seconds between two looks at a status."""
+TIMED_OUT = 0x05040000
+"""The code among them that says nothing about what was done."""
 
 
-def store(drives: Sequence[CanopenDrive]) -> None:
-    """Store all parameters of all drives in non-volatile memory (0x1010).
+class StoreRefusedError(DrivesError):
+    """The drive says that it has not stored anything: its memory is what it was."""
+
+
+def check_can_store(drive: ParameterDrive) -> None:
+    """Refuse a drive of which it is not known how it stores.
 
     Raises
     ------
     NotSupportedError
-        If a drive's profile does not know how; nothing was stored then.
-    WriteBackMixedError
-        If a drive refuses or does not answer in time: says which drives have stored and which
-        have not.  All of them work with what is in their memory.
+        Naming axis and profile; nothing was written.
     """
-    for drive in drives:
-        if not isinstance(drive.profile.store, Store):
-            raise NotSupportedError(
-                f"{drive.axis}: profile {drive.profile.name} does not say how this drive stores its "
-                "parameters; nothing was stored."
-            )
-    stored: list[str] = []
-    for drive in drives:
-        how = drive.profile.store
-        if isinstance(how, Store):
-            info = ObjectInfo(how.object, "UNSIGNED32", "store parameters")
-            try:
-                with uninterrupted():
-                    drive.write(info, SAVE_SIGNATURE, timeout=how.timeout)
-                    stored.append(drive.axis)
-            except DrivesError as error:
-                if isinstance(error, StoppedError) and len(stored) == len(drives):
-                    raise
-                raise _not_stored(drives, stored, error) from error
-
-
-def _not_stored(
-    drives: Sequence[CanopenDrive], stored: Sequence[str], cause: DrivesError
-) -> WriteBackMixedError:
-    holds = {
-        f"{d.axis} (node {d.node_id})": (
-            "stored: survives a power cycle"
-            if d.axis in stored
-            else "in working memory only, not stored"
+    if not isinstance(drive.profile.store, Store):
+        raise NotSupportedError(
+            f"{drive.axis}: profile {drive.profile.name} does not say how this drive stores its "
+            "parameters; nothing was written."
         )
-        for d in drives
-    }
-    listed = "; ".join(f"{place}: {what}" for place, what in holds.items())
-    return WriteBackMixedError(
-        f"storing failed ({cause}) All drives work with the parameters that are in their memory. "
-        f"{listed}. A power cycle brings back what those that have not stored held before; store "
-        "again, or use `fieldtool restore` with the backup.",
-        holds,
+
+
+def store(drive: ParameterDrive) -> None:
+    """Store all parameters of a drive as they stand in its working memory, and wait for the end.
+
+    Raises
+    ------
+    StoreRefusedError
+        If it says that it has not stored.
+    DrivesError
+        If storing failed midway or was not confirmed: then nobody knows what the memory holds.
+    """
+    how = drive.profile.store
+    if not isinstance(how, Store):
+        raise StoreRefusedError(
+            f"{drive.axis}: profile {drive.profile.name} does not say how it stores."
+        )
+    info = ObjectInfo(how.object, "UNSIGNED32", "store parameters")
+    try:
+        drive.write(info, how.signature_value, timeout=how.timeout)
+    except SdoAbortError as error:
+        if error.code >> 16 in NOT_BEGUN and error.code != TIMED_OUT:
+            raise StoreRefusedError(str(error)) from error
+        raise
+    if how.status is not None and how.status_done is not None:
+        _wait_for_status(drive, how.status, how.status_done, how.timeout)
+
+
+def _wait_for_status(
+    drive: ParameterDrive, status: ObjectAddress, done: int, timeout: float
+) -> None:
+    info = drive.info(status) or ObjectInfo(status, "UNSIGNED32", "store status")
+    for _ in range(max(1, round(timeout / POLLING))):
+        if (shown := drive.read(info)) == done:
+            return
+        drive.wait(POLLING)
+    raise SdoTimeoutError(
+        drive.axis,
+        status.index,
+        status.subindex,
+        f"shows {shown} {timeout:g} s after storing began; {done} would be done.",
     )

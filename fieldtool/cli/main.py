@@ -37,6 +37,7 @@ from drives.profile import MachineProfile
 from fieldtool import workflow
 from fieldtool.cli.bus_options import Bitrate, Channel, Interface, on_bus
 from fieldtool.cli.output import console_of, print_json
+from fieldtool.cli.restored import show_restored
 from fieldtool.cli.scan import scan
 from fieldtool.cli.screen import (
     TerminalScreen,
@@ -485,25 +486,28 @@ def restore(
     interface: Interface = None,
     channel: Channel = None,
     bitrate: Bitrate = None,
+    same_drives: Annotated[
+        bool,
+        typer.Option(
+            "--same-drives",
+            help="You know that drives without a serial number are those of the backup.",
+        ),
+    ] = False,
     trace: TraceWanted = False,
     trace_file: TraceFile = None,
+    as_json: Json = False,
 ) -> None:
-    """Bring a backup of the drives' parameters back."""
+    """Bring a backup of the drives' parameters back, or take back a write that was cut off."""
     folder = backup if backup.is_dir() else backup.parent
     if machine is None:
         machine = str(folder / "machine.yaml")
     traced = trace_path(trace, trace_file, folder)
     with _stop_key():
         profile = on_bus(machine, interface, channel, bitrate)
-        written = workflow.restore(profile, backup, store, traced)
-    console = console_of(False)
-    console.print(f"{len(written)} parameters differed and were restored; all were read back.")
-    console.print(
-        "They are stored too: they survive a power cycle."
-        if store
-        else "They are in the drives' working memory only: a power cycle brings back what was stored. "
-        "Use --store to keep them."
-    )
+        restored = workflow.restore(profile, backup, store, traced, same_drives)
+    show_restored(console_of(as_json), restored)
+    if as_json:
+        print_json(restored.as_dict())
 
 
 @app.command("import")

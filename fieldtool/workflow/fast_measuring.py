@@ -34,7 +34,7 @@ from fieldtool.workflow.planning import (
 from fieldtool.workflow.preparation import axes_of, recording_header, setting_of
 from fieldtool.workflow.session import Options, Screen, Session
 from fieldtool.workflow.stopped import check_loops, judge_stop
-from fieldtool.writeback.transaction import take_backup
+from fieldtool.writeback.backups import take_backup
 
 GUESSED_NOISE = 1e-3
 """Of the rated torque: noise of the torque before the pilot has measured it (one count of 0x6077)."""

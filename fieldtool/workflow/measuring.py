@@ -23,7 +23,7 @@ from fieldtool.records.recording import Experiment, Recording, RecordingWriter
 from fieldtool.workflow.models import prior_model
 from fieldtool.workflow.preparation import axes_of, recording_header, setting_of
 from fieldtool.workflow.session import Session
-from fieldtool.writeback.transaction import take_backup
+from fieldtool.writeback.backups import take_backup
 
 SETTLE_PERIODS = 17.0
 """Periods of the lowest mode that a tone takes to settle, for the estimate of a plan's duration."""

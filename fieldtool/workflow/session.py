@@ -26,6 +26,7 @@ from fieldtool.records.session_folder import SessionFolder
 from fieldtool.records.yaml_file import write_yaml
 from fieldtool.workflow.planning import PlannedFast
 from fieldtool.writeback.transaction import WriteBack
+from fieldtool.writeback.unfinished import refuse_unfinished
 
 PlanName = Literal["classic", "fast"]
 
@@ -208,6 +209,7 @@ def open_session(
     session.screen.stage(f"Connect to {profile.name}")
     try:
         with connect(profile, stop_requested=stop_requested, trace=options.trace) as group:
+            refuse_unfinished(profile.name, group.drives, folder.path)
             for drive in group.drives:
                 identity = drive.identity
                 folder.note("drive", axis=drive.axis, node=drive.node_id, name=identity.device_name)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from drives.canopen_drive import CanopenGroup, connect
 from drives.errors import UserStopError
-from drives.parameters import Change, HeldObject, load_backup
+from drives.parameters import Change
 from drives.profile import MachineProfile, load_machine
 from fieldtool.design.tuning import Tuning, design
 from fieldtool.design.tuning_file import read_tuning, tuning_as_dict
@@ -14,7 +14,6 @@ from fieldtool.errors import (
     FileFormatError,
     IdentificationError,
     NotEnoughDataError,
-    OutputError,
 )
 from fieldtool.frf.response import save_responses
 from fieldtool.identify.recorded import Identified, identify_recording
@@ -36,9 +35,9 @@ from fieldtool.workflow.session import (
     SessionResult,
     never,
     open_session,
-    parameter_table,
 )
-from fieldtool.writeback.transaction import WriteBack, apply, changes_for, undo
+from fieldtool.writeback.restoring import Restored, bring_back, source_of
+from fieldtool.writeback.transaction import WriteBack, apply, changes_for
 
 NOT_KNOWN = 0.3
 """Relative standard error of a mass or spring from which no controller is designed."""
@@ -233,19 +232,32 @@ def restore(
     backup: Path,
     store: bool = False,
     trace: Path | None = None,
-) -> tuple[HeldObject, ...]:
-    """Bring a backup back into a machine's drives; return what had to be written.
+    same_drives: bool = False,
+) -> Restored:
+    """Bring a backup back into a machine's drives, or take back a write that was cut off.
+
+    Parameters
+    ----------
+    machine
+        Name or file of a machine profile, or the profile.
+    backup
+        Session folder, or a backup file.
+    store
+        Store in non-volatile memory too.
+    trace
+        File that every frame is noted in; none where it is None.
+    same_drives
+        The user's word that drives without a serial number are those of the backup.
 
     Raises
     ------
     ProfileError, WrongDeviceError, WriteBackMixedError
         If the backup is none, was made on other drives, or does not come back whole.
     """
-    path = backup / "parameters-before.yaml" if backup.is_dir() else backup
-    load_backup(path)
+    source = source_of(backup, store)
     profile = machine if isinstance(machine, MachineProfile) else load_machine(machine)
-    with connect(profile, trace=trace) as group:
-        return undo(group.drives, path, store)
+    with connect(profile, trace=trace, to_move=False) as group:
+        return bring_back(profile.name, group.drives, source, store=store, same_drives=same_drives)
 
 
 def _measured(session: Session, group: CanopenGroup, options: Options) -> float:
@@ -340,37 +352,14 @@ def _write(
         changes = changes_for(group.drives, tuning)
         return WriteBack((), changes, in_memory=False, stored=False, backup=None)
     session.screen.stage("Write the new parameters, and read them back")
-    backup = folder.parameters_before
-
-    def confirmed(changes: Sequence[Change]) -> bool:
-        """Ask, and have the journal on the disk before the first write."""
-        if not confirm(changes):
-            return False
-        planned = WriteBack((), tuple(changes), in_memory=False, stored=False, backup=backup)
-        _journal(
-            session, planned, "begun: what the drives hold now is not known until they are read"
-        )
-        return True
-
-    result = apply(session.machine.name, group.drives, tuning, backup, confirmed, options.store)
-    try:
-        _journal(session, result, "ended")
-    except OutputError as error:
-        session.warn(f"{error} {result.sentence}")
+    result = apply(
+        session.machine.name,
+        group.drives,
+        tuning,
+        folder.parameters_before,
+        confirm,
+        options.store,
+    )
+    folder.note("write", written=result.in_memory, stored=result.stored)
     session.screen.say(result.sentence)
     return result
-
-
-def _journal(session: Session, result: WriteBack, state: str) -> None:
-    write_yaml(
-        session.folder.journal,
-        {
-            "format": "fieldtool-write-journal/1",
-            "machine": session.machine.name,
-            "state": state,
-            "backup": result.backup.name if result.backup else None,
-            "in_memory": result.in_memory,
-            "stored": result.stored,
-            "parameters": parameter_table(result),
-        },
-    )

@@ -1,26 +1,28 @@
 """Bring new parameters into the drives: all or nothing, read back, undoable."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 
 from drives.canopen_drive import CanopenDrive
-from drives.errors import NotSupportedError, ProfileError
+from drives.errors import NotSupportedError
 from drives.parameters import (
-    Backup,
     Change,
-    HeldObject,
+    DriveRecord,
+    Journal,
+    JournalEntry,
+    Storing,
+    Transaction,
     Written,
-    back_up,
+    check_can_store,
+    check_disabled,
     load_backup,
     planned_changes,
-    restore,
-    save_backup,
-    store,
-    write,
 )
 from fieldtool.design.tuning import Tuning
-from fieldtool.errors import OutputError
+from fieldtool.writeback.backups import take_backup
+from fieldtool.writeback.unfinished import JOURNAL, JournalKeeper, refuse_unfinished
 
 Confirm = Callable[[Sequence[Change]], bool]
 
@@ -50,50 +52,6 @@ class WriteBack:
             "The new parameters are in the drives' working memory only: a power cycle brings the old "
             "ones back. Use --store to keep them."
         )
-
-
-def take_backup(machine: str, drives: Sequence[CanopenDrive], path: Path) -> Path:
-    """Back up every writable parameter of every drive to a file; return the file.
-
-    A backup that is there already is never overwritten: it holds what the drives held before the
-    first write.  Where it holds what the drives hold now, it is this backup; otherwise this one
-    gets the next free name, ``NAME-2.yaml`` and so on.
-
-    Raises
-    ------
-    OutputError
-        If the file can not be written; then nothing may be changed.
-    """
-    backup = back_up(machine, drives)
-    for candidate in _names(path):
-        try:
-            if candidate.exists():
-                if _holds(candidate, backup):
-                    return candidate
-                continue
-            save_backup(backup, candidate)
-        except (OSError, ProfileError) as error:
-            reason = error.strerror if isinstance(error, OSError) else str(error)
-            raise OutputError(
-                f"{candidate}: the backup of the drives' parameters can not be written ({reason}). "
-                "Nothing is written to the drives without it. Make room, or choose another folder."
-            ) from error
-        return candidate
-    raise OutputError(f"{path}: there are too many backups beside it. Choose another folder.")
-
-
-def _names(path: Path) -> Iterator[Path]:
-    yield path
-    for number in range(2, 1000):
-        yield path.with_name(f"{path.stem}-{number}{path.suffix}")
-
-
-def _holds(path: Path, backup: Backup) -> bool:
-    """Whether this file is a whole backup of the same drives with the same values."""
-    try:
-        return load_backup(path).drives == backup.drives
-    except ProfileError:
-        return False
 
 
 def changes_for(drives: Sequence[CanopenDrive], tuning: Tuning) -> tuple[Change, ...]:
@@ -126,14 +84,16 @@ def apply(
     confirm: Confirm,
     keep: bool = False,
 ) -> WriteBack:
-    """Back up, show, ask, write, read back, and store if wanted.
+    """Back up, show, ask, write, read back, and store if wanted: all drives or none.
+
+    The journal, ``write-journal.yaml`` beside the backup, is on the disk before the first write.
 
     Parameters
     ----------
     machine
-        Name, for the backup.
+        Name, for backup and journal.
     drives
-        Disabled drives.
+        All drives of the machine, disabled.
     tuning
         New parameters.
     backup_path
@@ -145,24 +105,62 @@ def apply(
 
     Raises
     ------
-    WriteBackError, WriteBackMixedError
-        As ``drives.parameters.write``; and if not every drive stores the parameters.
+    UnfinishedWriteError
+        If a write before was cut off; nothing was changed.
+    NotSupportedError, DriveFaultError
+        If a value does not fit or a drive is enabled; nothing was changed.
     OutputError
-        If the backup can not be written; nothing was changed.
+        If backup or journal can not be written; nothing was changed.
+    WriteBackError
+        If a drive refused, altered a value or did not store: all drives hold their old values.
+    WriteBackMixedError
+        If not all of them could be brought back; says which drive holds what.
     """
+    refuse_unfinished(machine, drives, backup_path.parent)
     changes = changes_for(drives, tuning)
+    if keep:
+        for drive in drives:
+            check_can_store(drive)
     backup_path = take_backup(machine, drives, backup_path)
     if not confirm(changes):
         return WriteBack((), changes, in_memory=False, stored=False, backup=backup_path)
-    written = write(drives, changes)
-    if keep:
-        store(drives)
+    check_disabled(drives)
+    storing = Storing.ALL if keep else Storing.NONE
+    journal = planned_journal(machine, drives, changes, backup_path.name, storing)
+    keeper = JournalKeeper(backup_path.with_name(JOURNAL))
+    transaction = Transaction(drives, journal, load_backup(backup_path), keeper)
+    transaction.write()
+    written = tuple(Written(change, change.after) for change in changes)
     return WriteBack(written, changes, in_memory=True, stored=keep, backup=backup_path)
 
 
-def undo(drives: Sequence[CanopenDrive], path: Path, keep: bool = False) -> tuple[HeldObject, ...]:
-    """Bring a backup back into the drives it was made on; return what had to be written."""
-    written = restore(drives, load_backup(path))
-    if keep:
-        store(drives)
-    return written
+def planned_journal(
+    machine: str,
+    drives: Sequence[CanopenDrive],
+    changes: Sequence[Change],
+    backup: str,
+    storing: Storing,
+) -> Journal:
+    """Return the journal of a write of which nothing is done yet."""
+    return Journal(
+        machine,
+        datetime.now(UTC).isoformat(timespec="seconds"),
+        backup,
+        storing,
+        tuple(
+            DriveRecord(
+                drive.axis,
+                drive.node_id,
+                drive.identity.vendor_id,
+                drive.identity.product_code,
+                drive.identity.revision,
+                drive.identity.serial_number,
+                tuple(
+                    JournalEntry(change.info, change.before_raw, change.after_raw)
+                    for change in changes
+                    if change.axis == drive.axis
+                ),
+            )
+            for drive in drives
+        ),
+    )

@@ -152,17 +152,33 @@ def test_what_was_stored_survives_a_power_cycle_as_the_tool_said(session):
     )
 
 
-def test_a_store_that_fails_says_what_each_drive_holds(session):
+def test_a_store_that_fails_takes_the_others_back(session):
+    """The one whose memory is broken is named; all work with their old values."""
     session.inject(StoreFails(ARM))
     outcome = write(session, "--store")
     assert outcome.code == 7
-    assert "storing failed (arm, object 0x1010:01" in outcome.err
-    assert "table (node 11): stored" in outcome.err
-    assert "arm (node 12): in working memory only, not stored" in outcome.err
-    assert held(session, ARM) == NEW_RAW
+    assert "writing failed: arm, object 0x1010:01: the drive refused to write it" in outcome.err
+    assert (
+        "arm (node 12) holds the old values in working memory; what its non-volatile" in outcome.err
+    )
+    assert (
+        "table (node 11) holds the old values; its non-volatile memory holds the old values too"
+        in outcome.err
+    )
+    assert session.changed() == {}
     power_cycle(session)
-    assert held(session, TABLE) == NEW_RAW
-    assert held(session, ARM) == old(session, ARM)
+    assert session.changed() == {}
+
+
+def test_a_drive_that_refuses_to_store_takes_the_others_back(session):
+    """It says that it has not stored, so all drives are known to hold their old values."""
+    session.inject(StoreFails(ARM, 0x08000022))
+    outcome = write(session, "--store")
+    assert outcome.code == 6, outcome.err
+    assert "table stored the old values again" in outcome.err
+    assert session.changed() == {}
+    power_cycle(session)
+    assert session.changed() == {}
 
 
 # --- refused, altered, vanished ------------------------------------------------------------------
@@ -212,7 +228,7 @@ def test_a_drive_that_vanishes_while_it_is_written_is_named(session):
     dictionary.guards[VELOCITY_I] = lambda _: session.inject(NodeVanishes(ARM))
     outcome = write(session)
     assert outcome.code == 7
-    assert "arm (node 12), velocity_p, 0x2010:02 holds not known" in outcome.err
+    assert "arm (node 12) holds not known values of velocity_p 0x2010:02" in outcome.err
     assert TABLE not in session.changed(), "the other drive was restored"
 
 
@@ -376,7 +392,7 @@ def test_a_restore_that_can_not_be_whole_names_what_is_missing(session):
     assert outcome.code == 7
     assert "arm (node 12)" in outcome.err
     assert "0x2010:02 holds not known" in outcome.err
-    assert "Everything else was" in outcome.err
+    assert "table (node 11) holds the old values" in outcome.err
     assert set(session.changed()) == {ARM}
     assert set(session.changed()[ARM]) == {"0x2010:02"}
 

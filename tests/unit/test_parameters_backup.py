@@ -26,7 +26,7 @@ class FakeDrive:
 
     @property
     def identity(self):
-        return SimpleNamespace(vendor_id=1, product_code=2, serial_number=3)
+        return SimpleNamespace(vendor_id=1, product_code=2, serial_number=3, revision=4)
 
     def writable_parameters(self):
         return iter(self.values)
@@ -43,7 +43,7 @@ def info(data_type, index=0x2000, subindex=0):
 
 
 def backup_of(*held):
-    return Backup("machine", "2025-01-01T00:00:00+00:00", (DriveBackup("x", 5, 1, 2, 3, held),))
+    return Backup("machine", "2025-01-01T00:00:00+00:00", (DriveBackup("x", 5, 1, 2, 3, 4, held),))
 
 
 def test_what_could_not_be_written_again_is_left_out():
@@ -108,7 +108,7 @@ def test_an_object_twice_is_refused(tmp_path):
 def test_a_large_machine_can_be_loaded_again(tmp_path):
     """What can be saved can be restored: 12 drives of a thousand objects are above a megabyte."""
     held = tuple(HeldObject(info("REAL32", 0x2000 + k), _single(0.1 * k)) for k in range(1000))
-    drives = tuple(DriveBackup(f"x{k}", 1 + k, 1, 2, 3, held) for k in range(12))
+    drives = tuple(DriveBackup(f"x{k}", 1 + k, 1, 2, 3, 4, held) for k in range(12))
     backup = Backup("machine", "2025-01-01T00:00:00+00:00", drives)
     path = tmp_path / "b.yaml"
     save_backup(backup, path)
@@ -128,7 +128,7 @@ def test_a_disk_that_is_full_leaves_what_was_there(tmp_path, monkeypatch):
     def full(_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("drives.parameters.backup.os.fsync", full)
+    monkeypatch.setattr("drives.parameters.durable.os.fsync", full)
     with pytest.raises(OSError, match="No space"):
         save_backup(backup_of(HeldObject(info("UNSIGNED8"), 2)), path)
     assert path.read_bytes() == before

@@ -1,0 +1,171 @@
+"""Bring the old values back into one drive's working memory."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+
+from drives.errors import DrivesError, SdoTimeoutError
+from drives.objects import ObjectAddress
+from drives.parameters.access import take_over, unlock
+from drives.parameters.backup import DriveBackup
+from drives.parameters.journal import DriveRecord
+from drives.parameters.values import HeldObject, ParameterDrive, Raw, same
+
+PASSES = 3
+"""Times that values are written at most: some drives take one only after another."""
+
+
+class Found(StrEnum):
+    """What a drive was found to hold of the parameters of a write."""
+
+    OLD = "old values"
+    NEW = "new values"
+    MIXED = "old and new values mixed"
+    OTHER = "values that are neither old nor new"
+    SILENT = "no answer"
+
+
+@dataclass(frozen=True)
+class BroughtBack:
+    """What came of one drive."""
+
+    found: Found
+    written: tuple[HeldObject, ...]
+    """What differed and was written; all of it was read back."""
+    failed: Mapping[ObjectAddress, str]
+    """What the drive holds instead, in words, by object."""
+
+
+class SilentDriveError(DrivesError):
+    """The drive does not answer at all."""
+
+
+def look(drive: ParameterDrive, record: DriveRecord) -> Found:
+    """Read the parameters of a write, and say which of its values they are.
+
+    Raises
+    ------
+    SilentDriveError
+        If the drive does not answer.
+    """
+    seen = set()
+    for entry in record.entries:
+        try:
+            value = drive.read(entry.info)
+        except DrivesError as error:
+            _refuse_silent(drive, error)
+            seen.add(Found.OTHER)
+            continue
+        if same(entry.info, entry.before, entry.after):
+            kind = None if same(entry.info, value, entry.before) else Found.OTHER
+        elif same(entry.info, value, entry.before):
+            kind = Found.OLD
+        else:
+            kind = Found.NEW if same(entry.info, value, entry.after) else Found.OTHER
+        if kind is not None:
+            seen.add(kind)
+    if Found.OTHER in seen:
+        return Found.OTHER
+    if len(seen) == 2:
+        return Found.MIXED
+    return seen.pop() if seen else Found.OLD
+
+
+def bring_back(
+    drive: ParameterDrive, record: DriveRecord, backup: DriveBackup, *, whole: bool
+) -> BroughtBack:
+    """Write every old value that the drive does not hold, and read all of them back.
+
+    Parameters
+    ----------
+    drive
+        Disabled.
+    record
+        Whose entries come back in any case.
+    backup
+        Every parameter of the drive.
+    whole
+        Bring the whole backup back.  It comes back too where the drive holds values of neither
+        side, as after a reboot: then it has lost more than what was written.
+
+    Raises
+    ------
+    SilentDriveError
+        If the drive does not answer.
+    """
+    found = look(drive, record)
+    unlock(drive)
+    wanted = {entry.info.address: HeldObject(entry.info, entry.before) for entry in record.entries}
+    if whole or found is Found.OTHER:
+        wanted = {held.info.address: held for held in backup.held} | wanted
+    left = _in_order(drive, wanted.values())
+    written: list[HeldObject] = []
+    failed: dict[ObjectAddress, str] = {}
+    for _ in range(PASSES):
+        before = len(left)
+        left, failed = _one_pass(drive, left, written)
+        if not left or len(left) == before:
+            break
+    take_over(drive, {held.info.address for held in written})
+    # Only what was read back in the end counts: a later value may have changed an earlier one.
+    for held in tuple(written):
+        value = _read(drive, held)
+        if not (isinstance(value, _Unread) or same(held.info, value, held.value)):
+            failed[held.info.address] = f"{value}, was {held.value}"
+    kept = tuple(held for held in written if held.info.address not in failed)
+    return BroughtBack(found, kept, failed)
+
+
+class _Unread(str):
+    """Why an object could not be read or written."""
+
+    __slots__ = ()
+
+
+def _one_pass(
+    drive: ParameterDrive, wanted: Iterable[HeldObject], written: list[HeldObject]
+) -> tuple[list[HeldObject], dict[ObjectAddress, str]]:
+    """Write what differs; return what is left, and what the drive holds there instead."""
+    left, failed = [], {}
+    for held in wanted:
+        value = _read(drive, held)
+        if isinstance(value, _Unread) or not same(held.info, value, held.value):
+            refusal = _write(drive, held)
+            value = _read(drive, held)
+            if isinstance(value, _Unread):
+                failed[held.info.address] = f"not known ({refusal or value})"
+            elif not same(held.info, value, held.value):
+                failed[held.info.address] = f"{value}, was {held.value}"
+            else:
+                written.append(held)
+                continue
+            left.append(held)
+    return left, failed
+
+
+def _read(drive: ParameterDrive, held: HeldObject) -> Raw | _Unread:
+    try:
+        return drive.read(held.info)
+    except DrivesError as error:
+        _refuse_silent(drive, error)
+        return _Unread(error)
+
+
+def _write(drive: ParameterDrive, held: HeldObject) -> str:
+    try:
+        drive.write(held.info, held.value)
+    except DrivesError as error:
+        _refuse_silent(drive, error)
+        return str(error)
+    return ""
+
+
+def _refuse_silent(drive: ParameterDrive, error: DrivesError) -> None:
+    if isinstance(error, SdoTimeoutError) and not drive.answers():
+        raise SilentDriveError(f"{drive.axis}: node {drive.node_id} does not answer") from error
+
+
+def _in_order(drive: ParameterDrive, wanted: Iterable[HeldObject]) -> list[HeldObject]:
+    """Sort by the profile's order of writing; what it does not name comes behind, by address."""
+    order = {p.object: k for k, p in enumerate(drive.profile.parameters.values())}
+    return sorted(wanted, key=lambda h: (order.get(h.info.address, len(order)), h.info.address))

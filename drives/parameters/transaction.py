@@ -1,0 +1,255 @@
+"""Carry a write-back out on the drives, step by step as the journal's rules say, or take it back."""
+
+from collections.abc import Callable, Iterable
+
+from drives.canopen_drive.interrupts import uninterrupted
+from drives.errors import DrivesError, StoppedError, WriteBackError, WriteBackMixedError
+from drives.parameters.access import take_over, unlock
+from drives.parameters.backup import Backup
+from drives.parameters.bring_back import BroughtBack, Found, SilentDriveError, bring_back
+from drives.parameters.journal import (
+    Action,
+    DriveRecord,
+    Goal,
+    Journal,
+    Memory,
+    Step,
+    Storing,
+    next_step,
+)
+from drives.parameters.outcome import DriveOutcome, sentence, what_is_held
+from drives.parameters.store import StoreRefusedError, store
+from drives.parameters.values import ParameterDrive, same
+
+Save = Callable[[Journal], None]
+"""Brings a journal to the disk before it returns."""
+ROUNDS = 3
+"""Times that everything is brought back at most, where drives lose their supply meanwhile."""
+
+
+class MismatchError(DrivesError):
+    """A drive holds something else than what was written."""
+
+
+class Transaction:
+    """One write-back over all drives of a machine.
+
+    Parameters
+    ----------
+    drives
+        All of them, identified and disabled.
+    journal
+        How far it has come.
+    backup
+        Everything that the drives held before it.
+    save
+        Is given the journal before and after each step; what it raises ends the write.
+    """
+
+    def __init__(
+        self, drives: Iterable[ParameterDrive], journal: Journal, backup: Backup, save: Save
+    ) -> None:
+        self._drives = {drive.axis: drive for drive in drives}
+        self._backups = {part.axis: part for part in backup.drives}
+        self._save = save
+        self.journal = journal
+        self.outcomes = {r.axis: DriveOutcome(r.axis, r.node_id) for r in journal.drives}
+        self.unsaved: Exception | None = None
+        """Why the journal could not be saved on the way back."""
+
+    # --- forward ---------------------------------------------------------------------------------
+
+    def write(self) -> None:
+        """Write, check and, if the journal says so, store; all or nothing.
+
+        Raises
+        ------
+        WriteBackError
+            If a drive refused or holds another value: all drives hold their old values.
+        WriteBackMixedError
+            If the old values could not be brought back either; says which drive holds what.
+        """
+        try:
+            self._save(self.journal)
+            while (step := next_step(self.journal)) is not None:
+                self._step_forward(step)
+        except BaseException as error:
+            if self.journal.is_open:
+                self._take_back(error)
+            error.add_note(f"{_ENDED_WORDS[self.journal.state.value]}")
+            raise
+
+    def _step_forward(self, step: Step) -> None:
+        drive = self._drives.get(step.axis)
+        if step.action in (Action.STORE, Action.FINISH):
+            with uninterrupted():  # a stop waits for the answer, which says what the memory holds
+                self._begin(step)
+                if drive is None:
+                    if self.journal.storing is not Storing.NONE:  # it took its time
+                        for each in self._drives.values():
+                            self._check(each)
+                else:
+                    self._store(drive)
+                self._end(step)
+            return
+        self._begin(step)
+        if drive is not None:
+            entries = self.journal.drive(step.axis).entries
+            if step.action is Action.WRITE:
+                changed = [e for e in entries if not same(e.info, e.before, e.after)]
+                unlock(drive)
+                for entry in changed:
+                    drive.write(entry.info, entry.after)
+                take_over(drive, {entry.info.address for entry in changed})
+            else:
+                self._check(drive)
+        self._end(step)
+
+    def _check(self, drive: ParameterDrive) -> None:
+        """Read a drive's parameters back, and see that they are those of the goal."""
+        forward = self.journal.goal is Goal.NEW
+        for entry in self._record(drive.axis).entries:
+            wanted = entry.after if forward else entry.before
+            found = drive.read(entry.info)
+            if not same(entry.info, found, wanted):
+                raise MismatchError(
+                    f"{drive.axis}, {entry.info.name}, object {entry.info.address}: wrote {wanted}, "
+                    f"the drive holds {found}."
+                )
+
+    def _store(self, drive: ParameterDrive) -> None:
+        try:
+            store(drive)
+        except StoreRefusedError:
+            self.journal = self.journal.refused_to_store(drive.axis)
+            raise
+
+    def _begin(self, step: Step) -> None:
+        self._go(self.journal.began(step))
+
+    def _end(self, step: Step) -> None:
+        self._go(self.journal.ended(step))
+
+    def _go(self, journal: Journal) -> None:
+        if journal != self.journal:
+            self.journal = journal
+            self._save(journal)
+
+    def _record(self, axis: str) -> DriveRecord:
+        return self.journal.drive(axis)
+
+    # --- back ------------------------------------------------------------------------------------
+
+    def _take_back(self, cause: BaseException) -> None:
+        """Go back after a failure; raise what says how that ended, unless it was a stop."""
+        with uninterrupted():
+            self._back_again(self.journal.turned_back(distrust=False), whole=False)
+        reason = str(cause).rstrip(".") or type(cause).__name__
+        self._refuse_mixed(f"writing failed: {reason}. Not everything could be restored", cause)
+        if isinstance(cause, DrivesError) and not isinstance(cause, StoppedError):
+            raise WriteBackError(
+                f"{cause} Nothing was changed: all parameters were restored and read back."
+                f"{self._stored_back()}"
+            ) from cause
+
+    def restore(self) -> None:
+        """Bring the whole backup back into all drives, and store it as the journal says.
+
+        Raises
+        ------
+        WriteBackMixedError
+            If a value could not be restored or stored; every other one was.
+        """
+        with uninterrupted():
+            self._save(self.journal)
+            self._back_again(self.journal, whole=True)
+            self._refuse_mixed("not everything could be restored", None)
+
+    def _back_again(self, journal: Journal, *, whole: bool) -> None:
+        """Bring back until all drives hold their old values at the same time."""
+        self._go_quietly(journal)
+        for _ in range(ROUNDS):
+            self._back(whole=whole)
+            if all(outcome.trouble != _LOST for outcome in self.outcomes.values()):
+                return
+            self._go_quietly(self.journal.turned_back(distrust=True))
+
+    def _back(self, *, whole: bool) -> None:
+        given_up: set[str] = set()
+        for outcome in self.outcomes.values():
+            outcome.trouble = ""
+        while (step := next_step(self.journal, given_up)) is not None:
+            self._go_quietly(self.journal.began(step))
+            try:
+                if step.action is Action.FINISH:
+                    self._check_back(given_up)
+                    if given_up:
+                        continue
+                elif step.action is Action.BRING_BACK:
+                    self._bring_back(step.axis, whole=whole)
+                else:
+                    self._store(self._drives[step.axis])
+            except DrivesError as error:
+                self.outcomes[step.axis].trouble = str(error)
+                given_up.add(step.axis)
+                continue
+            self._go_quietly(self.journal.ended(step))
+        for record in self.journal.drives:
+            self.outcomes[record.axis].memory = record.memory
+
+    def _bring_back(self, axis: str, *, whole: bool) -> None:
+        outcome = self.outcomes[axis]
+        try:
+            done: BroughtBack = bring_back(
+                self._drives[axis], self._record(axis), self._backups[axis], whole=whole
+            )
+        except SilentDriveError:
+            outcome.found = Found.SILENT
+            raise
+        if not outcome.written:
+            outcome.found = done.found
+        again = {held.info.address for held in done.written}
+        kept = tuple(held for held in outcome.written if held.info.address not in again)
+        outcome.written = (*kept, *done.written)
+        outcome.failed = dict(done.failed)
+        entries = {entry.info.address for entry in self._record(axis).entries}
+        if entries & done.failed.keys():
+            raise MismatchError(f"{axis}: parameters of the write could not be brought back")
+
+    def _check_back(self, given_up: set[str]) -> None:
+        """See that drives that were brought back first have not lost their supply since."""
+        for axis, drive in self._drives.items():
+            if axis in self.outcomes and axis not in given_up:
+                try:
+                    self._check(drive)
+                except DrivesError:
+                    self.outcomes[axis].trouble = _LOST
+                    given_up.add(axis)
+
+    def _go_quietly(self, journal: Journal) -> None:
+        """Save the journal if that is possible: on the way back nothing may stand in it."""
+        try:
+            self._go(journal)
+        except Exception as error:
+            self.unsaved = error
+
+    def _refuse_mixed(self, what: str, cause: BaseException | None) -> None:
+        """Raise, if not everything is as it was."""
+        if all(outcome.is_back for outcome in self.outcomes.values()):
+            return
+        parts = self.journal, self.outcomes, self._backups
+        raise WriteBackMixedError(sentence(what, *parts), what_is_held(*parts)) from cause
+
+    def _stored_back(self) -> str:
+        back = [o.axis for o in self.outcomes.values() if o.memory is Memory.OLD]
+        if not back:
+            return ""
+        return f" {', '.join(back)} stored the old values again, so they survive a power cycle."
+
+
+_LOST = "lost the values that were brought back: did it lose its supply?"
+_ENDED_WORDS = {
+    "new": "The write had ended: all drives hold the new values.",
+    "old": "All drives hold the old values.",
+    "open": "The drives may hold old and new values mixed: use `fieldtool restore`.",
+}

@@ -1,0 +1,75 @@
+"""What a restore looks like on a terminal: what each drive held, and what was done."""
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from drives.parameters import DriveOutcome, Memory
+from fieldtool.writeback.restoring import Restored
+
+MEMORY_WORDS = {
+    Memory.UNTOUCHED: "as it was, not written",
+    Memory.OLD: "old values, stored",
+    Memory.NEW: "new values: a power cycle brings them",
+    Memory.UNKNOWN: "not known",
+}
+
+
+def show_restored(console: Console, restored: Restored) -> None:
+    """Show what each drive held, what was brought back, and where the old values are now."""
+    table = Table(box=None, padding=(0, 2))
+    for title in ("axis", "node", "found", "brought back", "working memory", "non-volatile memory"):
+        table.add_column(title, overflow="fold")
+    for outcome in restored.outcomes:
+        cells = (
+            outcome.axis,
+            str(outcome.node_id),
+            _found(outcome, restored.had_write),
+            _count(len(outcome.written)),
+            "old values",
+            MEMORY_WORDS[outcome.memory],
+        )
+        table.add_row(*(Text(cell) for cell in cells))
+    console.print(table)
+    for sentence in sentences(restored):
+        console.print(Text("  " + sentence))
+
+
+def sentences(restored: Restored) -> list[str]:
+    """Return what there is to say below the table."""
+    count = len(restored.written)
+    said = []
+    if restored.cut_off is not None:
+        said.append(
+            f"The write that began at {restored.cut_off.begun} had been cut off. It was taken back: all "
+            "drives hold the old values."
+        )
+    differed = (
+        "1 parameter differed and was" if count == 1 else f"{count} parameters differed and were"
+    )
+    said.append(f"{differed} restored; all were read back.")
+    memories = {outcome.memory for outcome in restored.outcomes}
+    if memories == {Memory.OLD}:
+        said.append("They are stored too: they survive a power cycle.")
+    elif Memory.NEW in memories:
+        said.append(
+            "They are in the drives' working memory only: a power cycle brings back what was stored. "
+            "Use --store to keep them."
+        )
+    else:
+        said.append(
+            "They are in the drives' working memory only, where it does not say stored: a power cycle "
+            "brings back what those drives held in their non-volatile memory before. Use --store to "
+            "keep them."
+        )
+    return [*said, *restored.notes]
+
+
+def _found(outcome: DriveOutcome, had_write: bool) -> str:
+    if had_write:
+        return outcome.found.value
+    return "as in the backup" if not outcome.written else "other values than the backup"
+
+
+def _count(number: int) -> str:
+    return {0: "nothing", 1: "1 parameter"}.get(number, f"{number} parameters")

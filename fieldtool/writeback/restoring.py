@@ -1,0 +1,254 @@
+"""Bring a backup back, or take a write back that was cut off."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from drives.canopen_drive import CanopenDrive
+from drives.errors import ProfileError
+from drives.parameters import (
+    Backup,
+    DriveBackup,
+    DriveOutcome,
+    DriveRecord,
+    HeldObject,
+    Journal,
+    JournalEntry,
+    Memory,
+    Phase,
+    Storing,
+    Transaction,
+    check_can_store,
+    check_disabled,
+    check_objects,
+    check_same_drives,
+    load_backup,
+    load_journal,
+)
+from drives.parameters.journal import Goal
+from fieldtool.writeback.unfinished import JOURNAL, JournalKeeper
+
+FIRST_BACKUP = "parameters-before.yaml"
+
+
+@dataclass(frozen=True)
+class Source:
+    """What is brought back: a backup, and the journal of the write that it was taken for."""
+
+    backup_path: Path
+    backup: Backup
+    journal: Journal | None
+    lost_journal: bool = False
+    """There is a journal, but it can not be read."""
+
+    @property
+    def cut_off(self) -> bool:
+        """Whether the write had not ended."""
+        return self.lost_journal or (self.journal is not None and self.journal.is_open)
+
+
+@dataclass(frozen=True)
+class Restored:
+    """What was found in the drives, and what was done."""
+
+    backup: Path
+    cut_off: Journal | None
+    """The write that had been cut off and was taken back; None if there was none."""
+    outcomes: tuple[DriveOutcome, ...]
+    had_write: bool
+    """Whether there is a journal that says what old and new values are."""
+    notes: tuple[str, ...]
+
+    @property
+    def written(self) -> tuple[HeldObject, ...]:
+        """All values that differed and were brought back."""
+        return tuple(held for outcome in self.outcomes for held in outcome.written)
+
+    @property
+    def stored(self) -> bool:
+        """Whether the old values are known to be in the non-volatile memory of all drives."""
+        return all(outcome.memory is Memory.OLD for outcome in self.outcomes)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values, as ``--json`` prints them."""
+        return {
+            "state": "old",
+            "cut_off": self.cut_off is not None,
+            "begun": self.cut_off.begun if self.cut_off else None,
+            "backup": str(self.backup),
+            "stored": self.stored,
+            "drives": [
+                {
+                    "axis": outcome.axis,
+                    "node_id": outcome.node_id,
+                    "found": outcome.found.value if self.had_write else None,
+                    "brought_back": [
+                        {
+                            "object": str(held.info.address),
+                            "name": held.info.name,
+                            "value": held.value,
+                        }
+                        for held in outcome.written
+                    ],
+                    "working_memory": "old",
+                    "non_volatile_memory": outcome.memory.value,
+                }
+                for outcome in self.outcomes
+            ],
+            "notes": list(self.notes),
+        }
+
+
+def source_of(path: Path, store: bool) -> Source:
+    """Read what a session folder or a backup file holds to be brought back.
+
+    Of a folder whose write was cut off, it is the backup that was taken for that write; otherwise
+    its first backup, from before the tool changed anything.
+
+    Raises
+    ------
+    ProfileError
+        If backup or journal are none, or not whole.
+    """
+    folder = path if path.is_dir() else path.parent
+    journal_path = folder / JOURNAL
+    journal, lost = None, False
+    if journal_path.exists():
+        try:
+            journal = load_journal(journal_path)
+        except ProfileError as error:
+            if path.is_dir() or not store:
+                raise ProfileError(
+                    error.path,
+                    f"{str(error).partition(': ')[2]}. It would say what the drives' non-volatile "
+                    "memory holds. To bring a backup back without it, and store it in all drives: "
+                    f"fieldtool restore {folder / FIRST_BACKUP} --store",
+                    error.line,
+                ) from error
+            lost = True
+    if path.is_dir():
+        name = journal.backup if journal is not None and journal.is_open else FIRST_BACKUP
+        path = path / name
+    return Source(path, load_backup(path), journal, lost)
+
+
+def bring_back(
+    machine: str,
+    drives: Sequence[CanopenDrive],
+    source: Source,
+    *,
+    store: bool = False,
+    same_drives: bool = False,
+) -> Restored:
+    """Bring all parameters of a backup back into all its drives, and store them where that is needed.
+
+    Parameters
+    ----------
+    machine
+        Name, for the journal.
+    drives
+        Of the machine; disabled.
+    source
+        What is brought back.
+    store
+        Store in all drives.  After a write that was cut off, drives whose non-volatile memory may
+        hold new values store the old ones in any case.
+    same_drives
+        The user's word that drives without a serial number are those of the backup.
+
+    Raises
+    ------
+    ProfileError, WrongDeviceError, DriveFaultError, NotSupportedError, OutputError
+        Before anything is written.
+    WriteBackMixedError
+        If a value could not be restored or stored; every other one was.
+    """
+    before = source.journal
+    journal = _journal_back(machine, source, store)
+    check_same_drives(drives, source.backup.drives, "backup", trusted=same_drives)
+    by_axis = {drive.axis: drive for drive in drives}
+    notes = []
+    for part, record in zip(source.backup.drives, journal.drives, strict=True):
+        drive = by_axis[part.axis]
+        check_objects(drive, (h.info for h in part.held), source.backup_path, "backup")
+        journal_path = source.backup_path.with_name(JOURNAL)
+        check_objects(drive, (e.info for e in record.entries), journal_path, "write journal")
+        if journal.storing is Storing.ALL or record.memory in (Memory.NEW, Memory.UNKNOWN):
+            check_can_store(drive)
+        if part.revision_number not in (0, drive.identity.revision):
+            notes.append(
+                f"{part.axis}: the backup was made with firmware revision "
+                f"0x{part.revision_number:08X}, the drive now has 0x{drive.identity.revision:08X}."
+            )
+    check_disabled(by_axis[part.axis] for part in source.backup.drives)
+    taking_part = [by_axis[part.axis] for part in source.backup.drives]
+    keeper = JournalKeeper(source.backup_path.with_name(JOURNAL))
+    transaction = Transaction(taking_part, journal, source.backup, keeper)
+    transaction.restore()
+    if transaction.unsaved is not None:
+        notes.append(
+            f"{transaction.unsaved} The drives are in order, but the journal does not say so: run "
+            "fieldtool restore once more."
+        )
+    return Restored(
+        source.backup_path,
+        before if before is not None and before.is_open else None,
+        tuple(transaction.outcomes.values()),
+        had_write=any(record.entries for record in journal.drives),
+        notes=tuple(notes),
+    )
+
+
+def _journal_back(machine: str, source: Source, store: bool) -> Journal:
+    """Return the journal of bringing a backup back; it goes on where one before was cut off."""
+    before = source.journal
+    missing = {r.axis for r in before.drives} if before is not None and before.is_open else set()
+    missing -= {part.axis for part in source.backup.drives}
+    if missing:
+        raise ProfileError(
+            source.backup_path,
+            f"holds nothing for axis {', '.join(sorted(missing))}, into which a write was cut off. Use "
+            "the session folder instead. Nothing was written.",
+        )
+    if store:
+        storing = Storing.ALL
+    elif before is None or not before.is_open:
+        storing = Storing.NONE
+    else:
+        storing = before.storing if before.goal is Goal.OLD else Storing.NEEDED
+    return Journal(
+        machine,
+        datetime.now(UTC).isoformat(timespec="seconds"),
+        source.backup_path.name,
+        storing,
+        tuple(_record_back(part, source) for part in source.backup.drives),
+        Goal.OLD,
+    )
+
+
+def _record_back(part: DriveBackup, source: Source) -> DriveRecord:
+    entries: tuple[JournalEntry, ...] = ()
+    memory = Memory.UNKNOWN if source.lost_journal else Memory.UNTOUCHED
+    if source.journal is not None:
+        old = {held.info.address: held.value for held in part.held}
+        for record in source.journal.drives:
+            if record.axis == part.axis:
+                memory = record.memory
+                entries = tuple(
+                    JournalEntry(e.info, old.get(e.info.address, e.before), e.after)
+                    for e in record.entries
+                )
+    return DriveRecord(
+        part.axis,
+        part.node_id,
+        part.vendor_id,
+        part.product_code,
+        part.revision_number,
+        part.serial_number,
+        entries,
+        Phase.GOING_BACK,
+        memory,
+        memory,
+    )

@@ -1,0 +1,222 @@
+"""Find a write-back that was cut off, whatever folder the next session is in.
+
+The journal is in the session folder.  While it is open, a small file for each drive lies in the
+user's state folder; it is named after the drive's vendor, product and serial number and says where
+the journal is.  Besides, the folders beside a new session's are looked through, for what another
+computer or user has left there.
+"""
+
+import os
+import re
+import sys
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import islice
+from pathlib import Path
+
+import yaml
+
+from drives.errors import ProfileError
+from drives.parameters import Journal, load_journal, save_journal
+from drives.parameters.durable import remove_durably, write_durably
+from drives.parameters.guard import Recorded
+from drives.parameters.values import ParameterDrive
+from drives.profile import read_yaml
+from fieldtool.errors import OutputError, UnfinishedWriteError
+
+FORMAT = "fieldtool-unfinished/1"
+JOURNAL = "write-journal.yaml"
+STATE_VARIABLE = "FIELDTOOL_STATE_DIR"
+"""Environment variable with another place for the user's state folder."""
+FOLDERS_LOOKED_THROUGH = 500
+"""Newest neighbours of a session folder that are looked through."""
+HEAD_BYTES = 1000
+"""Of a journal; whether it is open stands there."""
+
+
+class JournalKeeper:
+    """Saves a journal, and leaves a note for each drive as long as it is open.
+
+    Parameters
+    ----------
+    path
+        The journal's file, in its session folder.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._noted = False
+
+    def __call__(self, journal: Journal) -> None:
+        """Bring the journal to the disk before this returns.
+
+        Raises
+        ------
+        OutputError
+            If journal or notes can not be written.
+        """
+        try:
+            save_journal(journal, self.path)
+            if journal.is_open and not self._noted:
+                self._note(journal)
+                self._noted = True
+            elif not journal.is_open:
+                for record in journal.drives:
+                    remove_durably(_note_of(journal.machine, record))
+        except OSError as error:
+            raise OutputError(
+                f"{error.filename or self.path}: the journal of the write can not be kept "
+                f"({error.strerror}). Without it nothing is written to the drives. Make room, choose "
+                f"another folder, or name one for the notes in {STATE_VARIABLE}."
+            ) from error
+
+    def _note(self, journal: Journal) -> None:
+        state_folder().mkdir(parents=True, exist_ok=True)
+        for record in journal.drives:
+            data = {
+                "format": FORMAT,
+                "session": str(self.path.parent.resolve()),
+                "machine": journal.machine,
+                "axis": record.axis,
+                "begun": journal.begun,
+            }
+            write_durably(_note_of(journal.machine, record), yaml.safe_dump(data).encode())
+
+
+def state_folder() -> Path:
+    """Return the folder for notes about unfinished writes: one for each user of a computer."""
+    own = os.environ.get(STATE_VARIABLE)
+    if own:
+        return Path(own)
+    home = Path.home()
+    if sys.platform == "win32":
+        base = Path(os.environ.get("LOCALAPPDATA") or home / "AppData" / "Local")
+    elif sys.platform == "darwin":
+        base = home / "Library" / "Application Support"
+    else:
+        base = Path(os.environ.get("XDG_STATE_HOME") or home / ".local" / "state")
+    return base / "fieldtool" / "unfinished"
+
+
+def refuse_unfinished(machine: str, drives: Sequence[ParameterDrive], session: Path) -> None:
+    """Refuse to go on where a write into one of these drives was cut off.
+
+    Parameters
+    ----------
+    machine
+        Its name.
+    drives
+        Identified.
+    session
+        Folder of the session that is to begin; it and its neighbours are looked through too.
+
+    Raises
+    ------
+    UnfinishedWriteError
+        With the command that takes it back.
+    """
+    recorded = [_Identified(drive) for drive in drives]
+    for one in recorded:
+        note = _note_of(machine, one)
+        if note.exists():
+            folder = _folder_of(note)
+            if _is_open(folder / JOURNAL, note):
+                raise _refusal(folder, one.axis)
+            remove_durably(note)
+    for journal_file in (session / JOURNAL, *_neighbours(session)):
+        if journal_file.is_file() and _may_be_open(journal_file):
+            axis = _same_drive(journal_file, recorded, own=journal_file.parent == session)
+            if axis is not None:
+                raise _refusal(journal_file.parent, axis)
+
+
+def _refusal(folder: Path, axis: str) -> UnfinishedWriteError:
+    return UnfinishedWriteError(
+        f"{axis}: a write of parameters was cut off, and the drives may hold old and new ones mixed. "
+        f"Take it back first: fieldtool restore {folder}. Nothing was moved or written."
+    )
+
+
+class _Identified:
+    """A drive on the bus as a file would record it."""
+
+    def __init__(self, drive: ParameterDrive) -> None:
+        self.axis, self.node_id = drive.axis, drive.node_id
+        self.vendor_id = drive.identity.vendor_id
+        self.product_code = drive.identity.product_code
+        self.serial_number = drive.identity.serial_number
+
+
+def _note_of(machine: str, drive: Recorded) -> Path:
+    """Return the note's file: by serial number, else by the place on the machine."""
+    if drive.serial_number:
+        which = f"serial-{drive.serial_number}"
+    else:
+        which = f"{re.sub(r'[^A-Za-z0-9_-]', '_', machine)[:40]}-node-{drive.node_id}"
+    name = f"{drive.vendor_id:08x}-{drive.product_code:08x}-{which}.yaml"
+    return state_folder() / name
+
+
+def _folder_of(note: Path) -> Path:
+    try:
+        data, _ = read_yaml(note, 100_000)
+        if data.get("format") != FORMAT or not isinstance(data.get("session"), str):
+            raise ProfileError(note, f"format must be {FORMAT}")
+    except ProfileError as error:
+        raise UnfinishedWriteError(
+            f"{error}. It says where the journal of a write is that was cut off. Use `fieldtool "
+            "restore` with that session's folder, or delete the file if you know that the drives are "
+            "in order. Nothing was moved or written."
+        ) from error
+    return Path(data["session"])
+
+
+def _is_open(journal_file: Path, note: Path) -> bool:
+    try:
+        return load_journal(journal_file).is_open
+    except ProfileError as error:
+        raise UnfinishedWriteError(
+            f"a write of parameters into these drives was cut off, and its journal is not to be had: "
+            f"{error}. If the folder was moved, use `fieldtool restore` with where it is now; if the "
+            f"drives were brought in order elsewhere, delete {note}. Nothing was moved or written."
+        ) from error
+
+
+def _neighbours(session: Path) -> Iterator[Path]:
+    """Yield the journals of the newest folders beside this one."""
+    try:
+        with os.scandir(session.resolve().parent) as entries:
+            folders = [(e.stat().st_mtime, e.path) for e in entries if e.is_dir()]
+    except OSError:
+        return
+    folders.sort(reverse=True)
+    for _, folder in islice(folders, FOLDERS_LOOKED_THROUGH):
+        if Path(folder) != session.resolve():
+            yield Path(folder) / JOURNAL
+
+
+def _may_be_open(journal_file: Path) -> bool:
+    try:
+        with journal_file.open("rb") as file:
+            return b"state: open" in file.read(HEAD_BYTES)
+    except OSError:
+        return False
+
+
+def _same_drive(journal_file: Path, drives: Iterable[_Identified], *, own: bool) -> str | None:
+    """Return the axis of one of these drives that an open journal holds."""
+    try:
+        journal = load_journal(journal_file)
+    except ProfileError:
+        if own:
+            raise
+        return None
+    if not journal.is_open:
+        return None
+    for drive in drives:
+        for record in journal.drives:
+            known = (record.vendor_id, record.product_code, record.serial_number)
+            if known == (drive.vendor_id, drive.product_code, drive.serial_number) and (
+                drive.serial_number or (record.node_id == drive.node_id and own)
+            ):
+                return drive.axis
+    return None
