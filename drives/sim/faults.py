@@ -21,6 +21,10 @@ class Fault:
 
     node_id: int
 
+    def check(self, machine: "RunningMachine") -> None:
+        """Raise KeyError if the machine has no such node."""
+        machine.node(self.node_id)
+
     def set(self, machine: "RunningMachine", *, present: bool) -> None:
         """Bring it about or end it."""
         raise NotImplementedError

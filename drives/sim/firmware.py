@@ -261,7 +261,8 @@ class SimulatedAxes:
             if self._imperfect is not None:
                 position = seen(axis, position, self._imperfect.shafts)
                 self._imperfect.shafts.queue[axis] = np.floor(position * scale)
-            row[Signal.COUNTS] = np.floor(position * scale)
+            offset = self._settings.item(axis, Derived.ENCODER_OFFSET)
+            row[Signal.COUNTS] = np.floor(position * scale) + offset
             row[Signal.POSITION] = row[Signal.COUNTS] / scale
             row[Signal.VELOCITY] = state[self.plant.size + motor]
             row[Signal.SLOW_STEPS] = 0.0
@@ -316,6 +317,21 @@ class SimulatedAxes:
     def hold_encoder(self, axis: int, *, defect: bool) -> None:
         """Let the encoder stand where it is now; let go, it shows the true position at once."""
         self._settings[axis, Derived.ENCODER_HELD] = 1.0 if defect else 0.0
+
+    def hold_motor(self, axis: int, *, defect: bool) -> None:
+        """Let a closed brake, or an obstacle, hold the motor where it is, whatever its torque."""
+        self._settings[axis, Derived.MOTOR_HELD] = 1.0 if defect else 0.0
+
+    def shift_encoder(self, axis: int, counts: int) -> None:
+        """Let the encoder jump by so many counts: it is beside the motor from now on."""
+        self._settings[axis, Derived.ENCODER_OFFSET] += counts
+
+    def scale_torque_reading(self, axis: int, factor: float) -> None:
+        """Let measured torques be so many times what they are; 1 mends it."""
+        drive = self.hardware[axis]
+        per_mille = factor * 1000.0 / drive.rated_torque
+        self._settings[axis, Derived.PER_MILLE] = per_mille
+        self._settings[axis, Derived.NOISE_PER_MILLE] = per_mille * drive.torque_noise
 
     # -- what to follow ---------------------------------------------------------------------------
 
@@ -452,7 +468,7 @@ class SimulatedAxes:
         """Torque with fresh measurement noise, rounded to 1/1000 of the rated torque."""
         drive = self.hardware[axis]
         noisy = self.torque(axis) + float(self._draw()[axis]) * drive.torque_noise
-        return round(noisy * 1000.0 / drive.rated_torque)
+        return round(noisy * self._settings.item(axis, Derived.PER_MILLE))
 
     def latch(self) -> tuple[IntArray, IntArray, FloatArray]:
         """What all drives sample at a SYNC: counts, torque in 1/1000 of rated, velocity in rad/s.

@@ -18,6 +18,7 @@ from drives.sim.servo_kernel import (
     Signal,
     _control,
     _countable,
+    _hold_motor,
     _move_holding,
     _sample,
 )
@@ -61,9 +62,10 @@ def advance_forced(  # type: ignore[no-untyped-def]
     order, axes = state.size, motors.size
     progress, inputs = holding.progress, holding.inputs
     first = order + axes + holding.masses.size
-    change = state.copy()
+    change, before = state.copy(), state[motors]
     while progress[Progress.STEPS] < steps:
         if progress[Progress.LEFT] == 0:
+            before[:] = state[motors]
             time = (done + progress[Progress.STEPS]) * step
             for axis in range(axes):
                 torque = delivered(axis, _control(signals[axis], settings[axis], step), shafts)
@@ -82,6 +84,8 @@ def advance_forced(  # type: ignore[no-untyped-def]
             return Outcome.NEEDS_SET
         shafts.places[0] = (shafts.places[0] + 1) % shafts.queue.shape[1]
         for axis in range(axes):
+            if settings[axis, Derived.MOTOR_HELD] != 0.0:
+                _hold_motor(state, motors[axis], before[axis])
             _sample(signals[axis], settings[axis], seen(axis, state[motors[axis]], shafts), step)
             queue_counts(axis, signals[axis, Signal.COUNTS], shafts)
         progress[Progress.STEPS] += 1

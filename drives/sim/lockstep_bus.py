@@ -214,9 +214,21 @@ class LockstepBus(can.BusABC):
             raise can.CanOperationError(f"{self.channel_info}: CAN FD is not supported")
         line = self._line
         with line.lock:
+            if not line.machine.adapter.sound and not self._passes():
+                return
             if self._receive_own:
                 self.enqueue(_copy(msg, line.machine.now, received=False))
             line.transmit(self, msg)
+
+    def _passes(self) -> bool:
+        """Whether a faulty adapter lets a frame out; raise if it says that it does not."""
+        adapter, line = self._line.machine.adapter, self._line
+        if adapter.stall:
+            stall, adapter.stall = adapter.stall, 0
+            line.advance_to(line.machine.time + stall)
+        if adapter.sending:
+            raise can.CanOperationError(f"{self.channel_info}: {adapter.sending}")
+        return not adapter.mute
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
         """Return the next frame, or None if none comes in time.
@@ -232,7 +244,9 @@ class LockstepBus(can.BusABC):
         can.CanTimeoutError
             If ``timeout`` is None and nothing comes for ``SILENCE_LIMIT`` virtual seconds.
         """
-        queue = self._queue
+        queue, adapter = self._queue, self._line.machine.adapter
+        if adapter.receiving:
+            raise can.CanOperationError(f"{self.channel_info}: {adapter.receiving}")
         if queue and self._filters is None:
             with contextlib.suppress(IndexError):  # another thread may have been faster
                 return _message(queue.popleft())
@@ -293,6 +307,8 @@ class LockstepBus(can.BusABC):
 
     def enqueue(self, entry: Entry) -> None:
         """Take a frame in (called by what is at the far end)."""
+        if self._line.machine.adapter.deaf:
+            return
         self._queue.append(entry)
         if self._waiting:
             with self._frame_came:

@@ -92,6 +92,10 @@ class MotionControl:
         self._last_velocity: float | None = None
         self.position_actual = self.torque_actual = self.velocity_actual = 0
         """Latched at the last SYNC or communication task: counts, per mille, counts/s."""
+        self.forced_bits = 0
+        """Fault injection: bits of the statusword that are set whatever the drive does."""
+        self.enabling = True
+        """Fault injection: False while the drive can not be enabled."""
         self.update_limits()
         self.power_up()
 
@@ -143,7 +147,7 @@ class MotionControl:
             word |= _REACHED
         elif self._fault_code == FOLLOWING_ERROR:
             word |= _ERROR
-        return word
+        return word | self.forced_bits
 
     def latch(self, counts: int, per_mille: int, velocity: float) -> None:
         """Take what the firmware sampled: counts, per mille, rad/s.
@@ -318,7 +322,8 @@ class MotionControl:
                 self._fault_code = 0
                 self._enter(target)
             case (_, State.OPERATION_ENABLED):
-                self._enable(word)
+                if self.enabling:
+                    self._enable(word)
             case (_, State.QUICK_STOP_ACTIVE):
                 self._quick_stop()
             case (State.OPERATION_ENABLED, State.READY_TO_SWITCH_ON):

@@ -83,6 +83,8 @@ class DriveNode:
         self._scheduler, self._changed = scheduler, on_communication_change
         self.store_fails: int | None = None
         """Fault injection: abort code with which storing ends."""
+        self.on_store: Callable[[], None] | None = None
+        """Fault injection: called when storing begins."""
         self.nmt = NetworkManagement(node_id, self._reset)
         self.dictionary = dictionary = DriveDictionary(node_id, overrides)
         self.memory = NonVolatileMemory()
@@ -159,6 +161,11 @@ class DriveNode:
         """Switch the drive's supply off and on: what was not stored is forgotten."""
         self.nmt.pending_node_id = self.memory.node_id or self._first_node_id
         self._reset(whole=True)
+
+    def limit_torque(self, per_mille: float) -> None:
+        """Fault injection: let the firmware give so much torque at most, whatever 0x6072 says."""
+        parameter, limit = self._scales.limit((0x6072, 0), per_mille)
+        self._axes.set(self.axis, parameter, limit)
 
     # -- starting and resetting -------------------------------------------------------------------
 
@@ -367,6 +374,8 @@ class DriveNode:
             self.network.send(cob_id, data)
 
     def _begin_store(self, finish: Callable[[], int | None]) -> None:
+        if self.on_store is not None:
+            self.on_store()
         self.sdo.wait_with_answer(self.store_time, finish)
 
     def _save(self) -> int | None:

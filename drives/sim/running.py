@@ -14,6 +14,7 @@ from drives.sim.machine import SimulatedMachine
 from drives.sim.node import DriveNode
 from drives.sim.port import BusPort, Switchboard
 from drives.sim.scheduler import NANOSECONDS, VirtualScheduler, nanoseconds
+from drives.sim.wire import Adapter, Tamper, Wire, carried
 
 INNER_RATE = 8000
 """Steps of the firmware per second."""
@@ -48,6 +49,12 @@ class RunningMachine:
         self.axes = SimulatedAxes(machine.plant, hardware, machine.seed, float(INNER_RATE))
         self.carrier: object | None = None
         """What carries its frames, if several share that."""
+        self.wire = Wire()
+        """Fault injection: what befalls frames on their way."""
+        self.adapter = Adapter()
+        """Fault injection: how the host's adapter fares."""
+        self.syncs_missed: dict[int, float] = {}
+        """Fault injection: node ids that do not hear so many of the next SYNCs."""
         self.sync_count = 0
         """SYNCs handled since the start."""
         self._now = 0
@@ -115,6 +122,27 @@ class RunningMachine:
 
         A SYNC latches the inputs and lets received outputs act; it does not let time pass.
         """
+        if self.wire.to_nodes:
+            return self._carry(self.wire.to_nodes, self._deliver, cob_id, bytes(data))
+        return self._deliver(cob_id, data)
+
+    def _carry(
+        self,
+        tampers: dict[object, Tamper],
+        hand_on: Callable[[int, bytes], object],
+        cob_id: int,
+        data: bytes,
+    ) -> bool:
+        """Hand on what becomes of a frame, now or later; True if a SYNC was handed on now."""
+        synchronised = False
+        for delay, one, content in carried(tampers, cob_id, data):
+            if delay:
+                self.scheduler.add_at(self.scheduler.now + delay, hand_on, (one, content))
+            else:
+                synchronised = bool(hand_on(one, content)) or synchronised
+        return synchronised
+
+    def _deliver(self, cob_id: int, data: bytes | bytearray) -> bool:
         if self._by_sync is None:
             self._by_sync = self._listening_to_sync()
         synchronised = self._by_sync.get(cob_id)
@@ -125,6 +153,13 @@ class RunningMachine:
         return False
 
     def _transmit(self, cob_id: int, data: bytes) -> None:
+        if self.wire.from_nodes:
+            self._carry(self.wire.from_nodes, self.announce, cob_id, bytes(data))
+            return
+        self.announce(cob_id, data)
+
+    def announce(self, cob_id: int, data: bytes) -> None:
+        """Let all listeners hear a frame, as if a node (or somebody else on the bus) sent it."""
         now = self.scheduler.now
         for listener in self._listeners:
             listener(now, cob_id, data)
@@ -137,9 +172,15 @@ class RunningMachine:
         sampled = self.axes.latch()
         counts, torques, velocities = (values.tolist() for values in sampled)
         for node in nodes:
-            if node.network.connected:
+            if node.network.connected and not (self.syncs_missed and self._misses(node)):
                 axis = node.axis
                 node.at_sync(counts[axis], torques[axis], velocities[axis])
+
+    def _misses(self, node: DriveNode) -> bool:
+        left = self.syncs_missed.get(node.node_id, 0)
+        if left > 0:
+            self.syncs_missed[node.node_id] = left - 1
+        return left > 0
 
     def _listening_to_sync(self) -> dict[int, list[DriveNode]]:
         """Operational nodes by the SYNC identifier they are set to; the others' with no node."""
@@ -226,7 +267,7 @@ class RunningMachine:
         KeyError
             If there is no such node.
         """
-        self.node(fault.node_id)
+        fault.check(self)
         if at_time is not None and at_sync is not None:
             raise ValueError(f"{fault}: give either a time or a number of SYNCs, not both")
         if at_time is not None:

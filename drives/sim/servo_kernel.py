@@ -115,7 +115,11 @@ class Derived(IntEnum):
     """1, or -1 where the motor's phases are swapped: it pushes against what is measured."""
     ENCODER_HELD = 43
     """1 while the encoder stands still whatever the motor does."""
-    COLUMNS = 44
+    MOTOR_HELD = 44
+    """1 while a brake or an obstacle holds the motor where it is."""
+    ENCODER_OFFSET = 45
+    """Counts by which the encoder is beside the motor."""
+    COLUMNS = 46
 
 
 class Reference(IntEnum):
@@ -415,6 +419,7 @@ def _place_on_profile(signals, time):  # type: ignore[no-untyped-def]
 def _sample(signals, settings, position, step):  # type: ignore[no-untyped-def]
     """Encoder, velocity estimate, reference and what is watched, at the end of the inner step."""
     counts = np.floor(position * settings[Derived.COUNTS_PER_UNIT])
+    counts += settings[Derived.ENCODER_OFFSET]
     if settings[Derived.ENCODER_HELD] != 0.0:
         counts = signals[Signal.COUNTS]
     moved = (counts - signals[Signal.COUNTS]) / settings[Derived.COUNTS_PER_UNIT]
@@ -433,6 +438,13 @@ def _sample(signals, settings, position, step):  # type: ignore[no-untyped-def]
             signals[Signal.ERROR_EXCEEDED] = 1.0
     else:
         signals[Signal.ERROR_STEPS] = 0.0
+
+
+@njit(cache=True)
+def _hold_motor(state, motor, position):  # type: ignore[no-untyped-def]
+    """Leave a motor where it was, at rest: what holds it is stronger than anything else."""
+    state[motor] = position
+    state[state.size // 2 + motor] = 0.0
 
 
 @njit(cache=True)
@@ -468,6 +480,8 @@ def advance(steps, step, state, signals, settings, increments, motors):  # type:
             for i in range(order):
                 state[i] += increments[j, i] * value
         for axis in range(axes):
+            if settings[axis, Derived.MOTOR_HELD] != 0.0:
+                _hold_motor(state, motors[axis], old[motors[axis]])
             _sample(signals[axis], settings[axis], state[motors[axis]], step)
     return _countable(state, settings, motors)
 
@@ -500,9 +514,13 @@ def advance_holding(steps, step, state, signals, settings, motors, holding):  # 
     order, axes = state.size, motors.size
     progress, inputs = holding.progress, holding.inputs
     change = np.empty(order)
+    before = np.empty(axes)
+    for axis in range(axes):
+        before[axis] = state[motors[axis]]
     while progress[Progress.STEPS] < steps:
         if progress[Progress.LEFT] == 0:
             for axis in range(axes):
+                before[axis] = state[motors[axis]]
                 torque = _control(signals[axis], settings[axis], step)
                 inputs[order + axis] = settings[axis, Derived.MOTOR_SIGN] * torque
             progress[Progress.LEFT] = TICKS
@@ -512,6 +530,8 @@ def advance_holding(steps, step, state, signals, settings, motors, holding):  # 
         if not _move_holding(state, axes, holding, change):
             return Outcome.NEEDS_SET
         for axis in range(axes):
+            if settings[axis, Derived.MOTOR_HELD] != 0.0:
+                _hold_motor(state, motors[axis], before[axis])
             _sample(signals[axis], settings[axis], state[motors[axis]], step)
         progress[Progress.STEPS] += 1
     progress[Progress.STEPS] = 0

@@ -1,0 +1,349 @@
+"""One fault at one moment: the whole tool on a simulated machine, judged by the simulator's own truth.
+
+The moments are found by what happens on the bus and in the drives, never by wall time.  Nothing of
+the tool is replaced: a case is a command as a user gives it.
+"""
+
+import contextlib
+import io
+import re
+import struct
+import sys
+import tempfile
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from enum import Enum
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from drives.profile import load_machine
+from drives.sim.entries import ENTRIES
+from drives.sim.faults import Fault
+from drives.sim.lockstep_bus import register, unregister
+from drives.sim.machine import simulated_machine
+from drives.sim.node import DriveNode
+from drives.sim.running import RunningMachine
+from drives.sim.state_machine import State
+from fieldtool.cli.main import main
+from fieldtool.errors import FieldtoolError
+from fieldtool.records.recording import load
+from tests.session.conftest import PROCESS_VALUES, two_axes
+
+TABLE, ARM = 11, 12
+NAMES = {TABLE: "table", ARM: "arm"}
+BITRATE = 500_000
+"""Slow, so that the cycle is long and a case short."""
+GAINS = {(0x2010, 1): 20_000, (0x2010, 2): 2000, (0x2010, 3): 16_000}
+"""What the tuning that is written comes to in the drives, raw."""
+TUNING = {"velocity_p": 2.0, "velocity_i": 16.0, "position_p": 20.0}
+REQUESTS, STILL_SYNCS, MOVING_SYNCS, WRITES = 3, 40, 60, 2
+"""Requests of a node while connecting, SYNCs under power, changes of targets in the pilot, and gains
+written to a node, until the fault comes."""
+PATIENCE = 2.0
+"""Virtual seconds after the command's end within which everything must be off."""
+LONGEST = 120.0
+"""Virtual seconds that a command may take: more is a hang."""
+MOST_FRAMES = 400_000
+"""Frames that the host may send in a command."""
+POLL = 0.001
+"""Virtual seconds between two looks at the drives."""
+
+
+class Moment(Enum):
+    """When the fault comes."""
+
+    CONNECTING = "connecting"
+    STILL = "enabled and still"
+    SWEEP = "mid-sweep"
+    WRITE = "mid-write"
+
+
+class HangError(AssertionError):
+    """The tool does not end."""
+
+
+@dataclass
+class Watch:
+    """What the drives really did since the fault."""
+
+    fault_time: float | None = None
+    powered_then: frozenset[int] = frozenset()
+    positions_then: dict[int, float] = field(default_factory=dict)
+    reacted: dict[int, float] = field(default_factory=dict)
+    """By node: seconds after the fault at which it had left operation enabled."""
+    off: dict[int, float] = field(default_factory=dict)
+    """By node: seconds after the fault at which its power stage was off."""
+    farthest: dict[int, float] = field(default_factory=dict)
+    """By node: how far the motor went from where it was, rad."""
+
+
+@dataclass(frozen=True)
+class Result:
+    """What a case came to."""
+
+    code: int
+    said: str
+    """Everything on standard error, in one line."""
+    period: float
+    """Cycle time, s."""
+    watch: Watch
+    rows: tuple[int, ...]
+    """Rows of each recorded experiment, in order."""
+    complete: tuple[bool, ...]
+    changed: Mapping[int, Mapping[str, tuple[Any, Any]]]
+    """By node and object: what is not as it was before, as (was, is), but for the gains."""
+    gains: Mapping[int, str]
+    """By node: old, new or mixed."""
+    stored: Mapping[int, str]
+    """By node: what a power cycle would bring: old, new or mixed."""
+    still_on: tuple[int, ...]
+    """Nodes whose power stage was on at the end."""
+    enabled_again: bool
+    """Whether a drive was enabled again after all had reacted."""
+    restored: str
+    """What `fieldtool restore` came to where the write-back was not restored; else empty."""
+
+    def cycles(self, *without: int) -> float:
+        """Cycles until every drive that was on had left operation enabled."""
+        times = [t for node, t in self.watch.reacted.items() if node not in without]
+        return max(times, default=0.0) / self.period
+
+
+class Bench:
+    """A machine of two coupled axes, the command line in front of it, and one fault to come."""
+
+    def __init__(
+        self,
+        folder: Path,
+        moment: Moment,
+        faults: Callable[[int], tuple[Fault, ...]],
+        node: int = ARM,
+        profile: dict[str, Any] | None = None,
+        objects: Mapping[int, Mapping[tuple[int, int], Any]] | None = None,
+    ) -> None:
+        self.folder, self.moment, self.node = folder, moment, node
+        self._faults = faults(node)
+        self.channel = f"fault-{next(_numbers)}"
+        profile = profile or two_axes()
+        profile["bus"] |= {"channel": self.channel, "bitrate": BITRATE}
+        self.profile = folder / "bench.yaml"
+        self.profile.write_text(yaml.safe_dump(profile, sort_keys=False), encoding="utf-8")
+        described = simulated_machine(load_machine(self.profile))
+        drives = tuple(
+            replace(d, objects=dict((objects or {}).get(d.node_id, {}))) for d in described.drives
+        )
+        self.machine: RunningMachine = register(self.channel, replace(described, drives=drives))
+        self.before = {n.node_id: self._objects(n) for n in self.machine.nodes}
+        self.watch = Watch()
+        self._frames = self._requests = self._still = self._moving = self._writes = 0
+        self._motions, self._on = 0, False
+        self._targets: dict[int, bytes] = {}
+        self._period = 0.002
+        self._receive = self.machine.receive
+        self._enabled_again = False
+        self.machine.receive = self._seen  # type: ignore[method-assign]
+
+    def __enter__(self) -> "Bench":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        unregister(self.channel)
+
+    @property
+    def out(self) -> Path:
+        return self.folder / "session"
+
+    # -- moments ----------------------------------------------------------------------------------
+
+    def _seen(self, cob_id: int, data: bytes | bytearray) -> bool:
+        self._frames += 1
+        if self._frames > MOST_FRAMES or self.machine.now > LONGEST:
+            raise HangError(f"{self._frames} frames, {self.machine.now:.0f} s of virtual time")
+        if self.watch.fault_time is None and self._is_moment(cob_id, bytes(data)):
+            self._bring_about()
+        return self._receive(cob_id, data)
+
+    def _is_moment(self, cob_id: int, data: bytes) -> bool:
+        if self.moment is Moment.CONNECTING:
+            self._requests += cob_id == 0x600 + self.node
+            return self._requests >= REQUESTS
+        if self.moment is Moment.WRITE:
+            gain = cob_id == 0x600 + self.node and data[1:3] == b"\x10\x20" and data[0] >> 5 == 1
+            self._writes += gain
+            return self._writes >= WRITES
+        if cob_id - self.node == 0x200:
+            self._moving += self._targets.get(cob_id, data)[2:6] != data[2:6]
+            self._targets[cob_id] = data
+        if cob_id != 0x80:
+            return False
+        on = all(n.motion.state is State.OPERATION_ENABLED for n in self.machine.nodes)
+        if on != self._on:
+            self._on, self._still, self._moving = on, 0, 0
+            self._motions += on
+        self._still += on
+        if self.moment is Moment.STILL:
+            return self._still >= STILL_SYNCS
+        return on and self._motions >= 2 and self._moving >= MOVING_SYNCS
+
+    def _bring_about(self) -> None:
+        watch = self.watch
+        watch.fault_time, self._period = self.machine.now, self.machine.period / 1e9
+        watch.powered_then = frozenset(n.node_id for n in self.machine.nodes if n.motion.powered)
+        watch.positions_then = {n.node_id: self._position(n) for n in self.machine.nodes}
+        for fault in self._faults:
+            self.machine.inject(fault)
+        self._look()
+
+    def _position(self, node: DriveNode) -> float:
+        axes = self.machine.axes
+        return float(axes.state[axes.plant.motors[node.axis]])
+
+    def _look(self) -> None:
+        watch, after = self.watch, self.machine.scheduler.now / 1e9 - (self.watch.fault_time or 0)
+        reacted_before = len(watch.reacted)
+        for node in self.machine.nodes:
+            one, state = node.node_id, node.motion.state
+            if one in watch.powered_then and after > 0:
+                if state is not State.OPERATION_ENABLED:
+                    watch.reacted.setdefault(one, after)
+                elif reacted_before == len(watch.powered_then):
+                    self._enabled_again = True
+                if not node.motion.powered:
+                    watch.off.setdefault(one, after)
+            way = abs(self._position(node) - watch.positions_then[one])
+            watch.farthest[one] = max(watch.farthest.get(one, 0.0), way)
+        self.machine.scheduler.add(POLL, self._look)
+
+    # -- the command ------------------------------------------------------------------------------
+
+    def run(self) -> Result:
+        """Run the command that the moment belongs to, let time pass, and see what there is."""
+        if self.moment is Moment.WRITE:
+            self.out.mkdir()
+            (self.out / "machine.yaml").write_text(self.profile.read_text(), encoding="utf-8")
+            axes = [
+                {"axis": a, "parameters": TUNING, "sensitivity_peak": 1.4, "reason": "bench"}
+                for a in NAMES.values()
+            ]
+            tuning = {"format": "fieldtool-tuning/1", "axes": axes}
+            (self.out / "tuning.yaml").write_text(yaml.safe_dump(tuning), encoding="utf-8")
+            code, said = command("write", self.out, "--yes", "--store")
+        else:
+            code, said = command("measure", self.profile, "--yes", "--out", self.out)
+        if self.watch.fault_time is None:
+            raise AssertionError(f"the moment never came; exit code {code}: {said}")
+        ended = self.machine.time
+        self.machine.advance_to(ended + round(PATIENCE * 1e9))
+        return self._result(code, said)
+
+    def _result(self, code: int, said: str) -> Result:
+        rows, complete = self._recorded()
+        nodes = self.machine.nodes
+        changed = {n.node_id: self._changed(n) for n in nodes}
+        gains = {n.node_id: self._kind(n, n.dictionary.read) for n in nodes}
+        stored = {n.node_id: self._kind(n, self._after_power_cycle(n)) for n in nodes}
+        still_on = tuple(n.node_id for n in nodes if n.motion.powered)
+        return Result(
+            code,
+            said,
+            self._period,
+            self.watch,
+            rows,
+            complete,
+            {node: what for node, what in changed.items() if what},
+            gains,
+            stored,
+            still_on,
+            self._enabled_again,
+            self._restored() if code in (4, 6, 7) and self.moment is Moment.WRITE else "",
+        )
+
+    def _restored(self) -> str:
+        """Mend everything, and let the tool restore: all old, whatever it was."""
+        for fault in self._faults:
+            self.machine.lift(fault)
+        code, said = command("restore", self.out)
+        gains = {self._kind(n, n.dictionary.read) for n in self.machine.nodes}
+        return "" if code == 0 and gains == {"old"} else f"restore: {code}, {gains}: {said}"
+
+    def _recorded(self) -> tuple[tuple[int, ...], tuple[bool, ...]]:
+        try:
+            experiments = load(self.out / "recording.h5").experiments
+        except FieldtoolError:
+            return (), ()
+        return tuple(e.samples for e in experiments), tuple(e.complete for e in experiments)
+
+    # -- what drives hold -------------------------------------------------------------------------
+
+    @staticmethod
+    def _objects(node: DriveNode) -> dict[tuple[int, int], Any]:
+        return {
+            key: _as_on_the_wire(node.dictionary.read(*key))
+            for key, entry in ENTRIES.items()
+            if entry.access != "wo" and key not in PROCESS_VALUES
+        }
+
+    def _changed(self, node: DriveNode) -> dict[str, tuple[Any, Any]]:
+        was, now = self.before[node.node_id], self._objects(node)
+        return {
+            f"0x{key[0]:04X}:{key[1]:02X}": (was[key], now[key])
+            for key in was
+            if was[key] != now[key] and key not in GAINS
+        }
+
+    def _kind(self, node: DriveNode, read: Callable[[int, int], Any]) -> str:
+        held = {key: read(*key) for key in GAINS}
+        if held == {key: self.before[node.node_id][key] for key in GAINS}:
+            return "old"
+        return "new" if held == GAINS else "mixed"
+
+    @staticmethod
+    def _after_power_cycle(node: DriveNode) -> Callable[[int, int], Any]:
+        stored = node.memory.stored
+
+        def read(index: int, subindex: int) -> Any:
+            factory = node.dictionary.factory_value(ENTRIES[index, subindex])
+            return stored.get((index, subindex), factory)
+
+        return read
+
+
+def _as_on_the_wire(value: Any) -> Any:
+    return struct.unpack("<f", struct.pack("<f", value))[0] if isinstance(value, float) else value
+
+
+_numbers = count()
+
+
+def command(*arguments: object) -> tuple[int, str]:
+    """Run a command in this process; return its exit code and what it said on standard error."""
+    out, err = io.StringIO(), io.StringIO()
+    code: Any = 0
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            main([str(a) for a in arguments])
+        except SystemExit as ended:
+            code = ended.code
+    said = re.sub(r"\s+", " ", f"{err.getvalue()} {out.getvalue()}")
+    return code if isinstance(code, int) else 0, re.sub(r"SIMULATED.*ageing of drives\. ", "", said)
+
+
+def try_case(
+    moment: Moment,
+    faults: Callable[[int], tuple[Fault, ...]],
+    node: int = ARM,
+    **options: Any,
+) -> Result:
+    """Run one case in a folder of its own."""
+    with (
+        tempfile.TemporaryDirectory(prefix="fault-bench-") as folder,
+        Bench(Path(folder), moment, faults, node, **options) as bench,
+    ):
+        return bench.run()
+
+
+if __name__ == "__main__":
+    sys.exit("run `python -m tests.benchmarks faults`")
