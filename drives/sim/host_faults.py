@@ -1,6 +1,6 @@
 """Faults of the host and its CAN adapter, as the simulated bus shows them to it."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from drives.sim.faults import Fault
@@ -20,50 +20,50 @@ class HostFault(Fault):
     def check(self, machine: "RunningMachine") -> None:
         """Nothing has to be there."""
 
-    def fault(self) -> dict[str, object]:
-        """Return what is the matter with the adapter, by field."""
+    def adapter(self) -> Adapter:
+        """Return the adapter with its defect."""
         raise NotImplementedError
 
     def set(self, machine: "RunningMachine", *, present: bool) -> None:
         """Spoil the adapter, or mend it."""
-        machine.adapter = replace(Adapter(), **self.fault()) if present else Adapter()
+        machine.adapter = self.adapter() if present else Adapter()
 
 
 @dataclass(frozen=True)
 class BusOff(HostFault):
     """The adapter's controller went bus off: it takes no frame and hears none."""
 
-    def fault(self) -> dict[str, object]:
+    def adapter(self) -> Adapter:
         """Sending fails."""
-        return {"sending": "Transmit buffer full (bus off) [Error Code 105]", "deaf": True}
+        return Adapter(sending="Transmit buffer full (bus off) [Error Code 105]", deaf=True)
 
 
 @dataclass(frozen=True)
 class InterfaceDown(HostFault):
     """The interface was taken down, or its adapter pulled out."""
 
-    def fault(self) -> dict[str, object]:
+    def adapter(self) -> Adapter:
         """Both ways fail."""
         down = "Network is down [Error Code 100]"
-        return {"sending": down, "receiving": down}
+        return Adapter(sending=down, receiving=down)
 
 
 @dataclass(frozen=True)
 class ReceiverDead(HostFault):
     """What receives on the host has died without a word, while frames still go out."""
 
-    def fault(self) -> dict[str, object]:
+    def adapter(self) -> Adapter:
         """Nothing is heard."""
-        return {"deaf": True}
+        return Adapter(deaf=True)
 
 
 @dataclass(frozen=True)
 class HostKilled(HostFault):
     """The host is gone: from now on nothing of it reaches the bus."""
 
-    def fault(self) -> dict[str, object]:
+    def adapter(self) -> Adapter:
         """Nothing is said nor heard."""
-        return {"mute": True, "deaf": True}
+        return Adapter(mute=True, deaf=True)
 
 
 @dataclass(frozen=True)
@@ -72,6 +72,6 @@ class HostStalls(HostFault):
 
     seconds: float = 0.5
 
-    def fault(self) -> dict[str, object]:
+    def adapter(self) -> Adapter:
         """It goes on afterwards."""
-        return {"stall": nanoseconds(self.seconds)}
+        return Adapter(stall=nanoseconds(self.seconds))
