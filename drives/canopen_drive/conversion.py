@@ -11,7 +11,7 @@ which is the cascade with the whole reference velocity fed forward, because D ac
 """
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import isfinite, prod, sqrt
 
 from drives.errors import NotSupportedError
@@ -30,6 +30,8 @@ class Conversion:
     profile: DriveProfile
     quantities: Mapping[str, float]
     """By name, SI."""
+    unmet: Mapping[str, str] = field(default_factory=dict)
+    """Parameters whose unit is not the profile's in this drive: why, in words."""
 
     def physical(self, name: str, raw: Raw, others: Mapping[str, float]) -> float:
         """Return a parameter's physical value.
@@ -73,10 +75,14 @@ class Conversion:
     def understood(self, name: str) -> bool:
         """Whether the profile knows what a parameter's unit is worth."""
         parameter = self.profile.parameters[name]
-        return parameter.factor != "unknown" and all(
-            other in self.quantities
-            or (other in self.profile.parameters and self.understood(other))
-            for other in parameter.times
+        return (
+            parameter.factor != "unknown"
+            and name not in self.unmet
+            and all(
+                other in self.quantities
+                or (other in self.profile.parameters and self.understood(other))
+                for other in parameter.times
+            )
         )
 
     def _factor(self, name: str, parameter: ParameterInfo, others: Mapping[str, float]) -> float:
@@ -84,6 +90,8 @@ class Conversion:
             scale = parameter.scale
         except NotSupportedError as error:
             raise NotSupportedError(f"{self.axis}, {name}, {error}") from None
+        if name in self.unmet:
+            raise NotSupportedError(f"{self.axis}, {name}: {self.unmet[name]}")
         known = {**others, **self.quantities}
         lacking = [other for other in parameter.times if other not in known]
         if lacking:

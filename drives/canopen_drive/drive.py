@@ -43,8 +43,9 @@ class CanopenDrive:
     """A CiA 402 drive behind SDO; enabling and motion belong to ``CanopenMotion``."""
 
     def __init__(self, line: Line, axis: AxisProfile, profile: DriveProfile) -> None:
-        self.line, self.profile, self._axis = line, profile, axis
+        self.line, self._axis = line, axis
         self.dictionary = _read_eds(profile)
+        self.profile = profile.with_types_of(self.dictionary)
         self.node = Node(axis.node_id, ObjectDictionary())
         line.add_node(self.node)
         self._identity: DriveIdentity | None = None
@@ -132,7 +133,7 @@ class CanopenDrive:
                 and not 0x1200 <= address.index < 0x2000
                 and writable(variable)
                 and address.index not in objects.COMMANDS
-                and address not in self.profile.volatile_commands
+                and not self.profile.is_volatile(address)
             ):
                 yield info
 
@@ -247,17 +248,18 @@ class CanopenDrive:
             self._text(objects.DEVICE_NAME),
             self._text(objects.FIRMWARE_VERSION),
         )
-        wanted = self.profile.identity
-        for what, expected, found in (
-            ("device type 0x1000", wanted.device_type, self._identity.device_type),
-            ("vendor-ID 0x1018:01", wanted.vendor_id, self._identity.vendor_id),
-            ("product code 0x1018:02", wanted.product_code, self._identity.product_code),
-            ("serial number 0x1018:04", self._axis.serial_number, self._identity.serial_number),
+        wanted, found = self.profile.identity, self._identity
+        mask = 0xFFFF if wanted.low_word_only else 0xFFFFFFFF
+        for what, expected, held, bits in (
+            ("device type 0x1000", wanted.device_type, found.device_type, mask),
+            ("vendor-ID 0x1018:01", wanted.vendor_id, found.vendor_id, 0xFFFFFFFF),
+            ("product code 0x1018:02", wanted.product_code, found.product_code, 0xFFFFFFFF),
+            ("serial number 0x1018:04", self._axis.serial_number, found.serial_number, 0xFFFFFFFF),
         ):
-            if expected is not None and expected != found:
+            if expected is not None and expected & bits != held & bits:
                 raise WrongDeviceError(
                     f"{self.axis}: node {self.node_id} is another device than profile "
-                    f"{self.profile.name} says: {what} is 0x{found:08X}, expected "
+                    f"{self.profile.name} says: {what} is 0x{held:08X}, expected "
                     f"0x{expected:08X}. Check the node id and the machine profile."
                 )
         return self._identity
@@ -320,7 +322,23 @@ class CanopenDrive:
         }
         for name, info, scale in quantity_objects(self.profile):
             quantities[name] = float(self.read(info)) * scale
-        return Conversion(self.axis, self.profile, quantities)
+        return Conversion(self.axis, self.profile, quantities, dict(self._unmet_conditions()))
+
+    def _unmet_conditions(self) -> Iterator[tuple[str, str]]:
+        for name, parameter in self.profile.parameters.items():
+            condition = parameter.only_if
+            if condition is None:
+                continue
+            info = ObjectInfo(condition.object, condition.type, "condition")
+            found = self.read_optional(info)
+            if found == condition.equals or (found is None and condition.missing_is_fine):
+                continue
+            yield (
+                name,
+                f"its unit is known only while object {condition.object} is {condition.equals} "
+                f"(0x{condition.equals:X}); the drive has {'none' if found is None else found}. Set it, "
+                "or enter the gain with the maker's software.",
+            )
 
     def check_limits(self) -> None:
         """Refuse limits that the drive's units can not express: they could not be watched.

@@ -72,6 +72,13 @@ def read_loop(drive: CanopenDrive) -> dict[str, float]:
     """
     conversion = drive.conversion()
     values = conversion.as_cascade(read_parameters(drive))
+    for name, one in drive.profile.parameters.items():
+        if name in values and one.follows in values and values[name] != values[one.follows]:
+            raise NotSupportedError(
+                f"{drive.axis}: {name} is {values[name]:g} and {one.follows} {values[one.follows]:g}; "
+                "while they differ the drive changes its gains by itself, and what a target does is not "
+                "predicted. Give both the same value first."
+            )
     lacking = [name for name in CASCADE_PARAMETERS if name not in values]
     if not lacking:
         return values
@@ -102,7 +109,7 @@ def planned_changes(drive: CanopenDrive, wanted: Mapping[str, float]) -> tuple[C
             f"Enter {', '.join(wanted)} with the maker's software. Nothing was written."
         )
     conversion = drive.conversion()
-    held = conversion.as_held(wanted)
+    held = _with_followers(drive, conversion.as_held(wanted))
     _check_names(drive, held)
     changes = []
     old: dict[str, float] = {}
@@ -131,6 +138,17 @@ NOT_WRITTEN = {
     "unknown": "drive profile {profile} does not know how the drive's gains are written.",
 }
 """Ways to gains (``gains_via``) by which this tool writes nothing, in a sentence each."""
+
+
+def _with_followers(drive: CanopenDrive, held: Mapping[str, float]) -> dict[str, float]:
+    """Add the parameters that always get the value of another one."""
+    parameters = drive.profile.parameters
+    followers = {
+        name: held[one.follows]
+        for name, one in parameters.items()
+        if one.follows is not None and one.follows in held
+    }
+    return {**followers, **held}
 
 
 def _is_off(name: str, value: float) -> bool:

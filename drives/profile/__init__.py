@@ -20,7 +20,7 @@ from drives.profile.machine import (
     MachineProfile,
     MotorInertia,
 )
-from drives.profile.parameter import FilterInfo, Latch, ParameterInfo, Store, Unlock
+from drives.profile.parameter import Condition, FilterInfo, Latch, ParameterInfo, Store, Unlock
 from drives.profile.scales import PositionScale, Quantity, SyncRules, TorqueScale
 from drives.profile.simulation import SimulatedAxisProfile, SimulationProfile
 from drives.profile.values import DIMENSIONS, UNKNOWN, known
@@ -33,6 +33,7 @@ __all__ = [
     "AxisProfile",
     "BusProfile",
     "ChainProfile",
+    "Condition",
     "CouplingProfile",
     "DriveProfile",
     "EffectProfile",

@@ -3,8 +3,12 @@
 from pathlib import Path
 from typing import Annotated, Literal
 
+from canopen.objectdictionary import ObjectDictionary
 from pydantic import Field, model_validator
 
+from drives.errors import ProfileError
+from drives.objects import ObjectAddress
+from drives.profile.eds import info_at
 from drives.profile.parameter import FilterInfo, GainsVia, Latch, ParameterInfo, Store, Unlock
 from drives.profile.scales import PositionScale, Quantity, SyncRules, TorqueScale, VelocityUnit
 from drives.profile.values import (
@@ -34,6 +38,8 @@ class Identity(Part):
     """Compare the low word of the device type (its CiA profile) alone."""
     vendor_id: int | None = None
     product_code: int | None = None
+    supported_modes: int | None = None
+    """All of 0x6502, where it tells this drive from its maker's others."""
 
 
 class DriveProfile(Part):
@@ -77,7 +83,8 @@ class DriveProfile(Part):
     from position error to torque, whose D acts on the error."""
     gains_via: GainsVia = "objects"
     volatile_commands: tuple[Address, ...] = ()
-    """Writable objects that are commands, not parameters: never backed up nor restored."""
+    """Writable objects that are commands, not parameters, or that the drive refuses to have written:
+    never backed up nor restored.  Without a sub-index: all of the object."""
     feed_forward: tuple[str, ...] = ()
     """Names of parameters that are zero while frequency responses are measured: feed-forward of
     a target that is linear between SYNCs makes the torque jump at every SYNC, just where it is
@@ -105,6 +112,14 @@ class DriveProfile(Part):
                     raise LocatedError(
                         ("latches", k, "after", j), f"{name} is not among the parameters"
                     )
+        earlier: set[str] = set()
+        for name, parameter in self.parameters.items():
+            if parameter.follows is not None and parameter.follows not in earlier:
+                raise LocatedError(
+                    ("parameters", name, "follows"),
+                    f"{parameter.follows} is no parameter that stands before {name}",
+                )
+            earlier.add(name)
         before = {*BUILT_IN_QUANTITIES, *self.quantities}
         for name, parameter in self.parameters.items():
             for other in parameter.times:
@@ -141,6 +156,39 @@ class DriveProfile(Part):
     def unknown(self) -> tuple[str, ...]:
         """Keys under which the profile says ``unknown``, dotted."""
         return unknown_keys(self)
+
+    def is_volatile(self, address: ObjectAddress) -> bool:
+        """Whether an object is among ``volatile_commands``."""
+        return not {address, ObjectAddress(address.index)}.isdisjoint(self.volatile_commands)
+
+    def with_types_of(self, dictionary: ObjectDictionary) -> "DriveProfile":
+        """Return the profile with every parameter's type from an EDS file.
+
+        Raises
+        ------
+        ProfileError
+            If the file has no such object, or gives it another type than the profile says.
+        """
+        typed = {}
+        for name, parameter in self.parameters.items():
+            info = info_at(dictionary, parameter.object)
+            told = parameter.told_type
+            if info is None:
+                raise ProfileError(
+                    self.path,
+                    f"parameters.{name}: {Path(self.eds).name} has no object {parameter.object} with a "
+                    "type that can be written. Give the drive's own EDS with `eds:` at the axis in the "
+                    "machine profile, or a drive profile without it",
+                )
+            if told not in (UNKNOWN, info.type):
+                raise ProfileError(
+                    self.path,
+                    f"parameters.{name}: object {parameter.object} is {told} here and {info.type} in "
+                    f"{Path(self.eds).name}. The EDS of the drive's firmware is right: correct the "
+                    "profile",
+                )
+            typed[name] = parameter.model_copy(update={"told_type": info.type})
+        return self.model_copy(update={"parameters": typed})
 
     def with_eds(self, path: Path) -> "DriveProfile":
         """Return the profile with another EDS file: that of the drive at hand."""

@@ -15,7 +15,7 @@ from drives.objects import (
     TARGET_TORQUE,
     VENDOR_ID,
 )
-from drives.profile.drive import DriveProfile
+from drives.profile.drive import DriveProfile, Identity
 from drives.profile.eds import default_at, info_at, read_eds
 from drives.profile.loading import load_drive, packaged
 from drives.profile.values import UNKNOWN
@@ -86,6 +86,7 @@ def match(profile: DriveProfile, presented: Presented) -> Match:
         ("device type 0x1000", wanted.device_type, presented.device_type, mask, 1),
         ("vendor-ID 0x1018:01", wanted.vendor_id, presented.vendor_id, 0xFFFFFFFF, 10),
         ("product code 0x1018:02", wanted.product_code, presented.product_code, 0xFFFFFFFF, 20),
+        ("0x6502", wanted.supported_modes, presented.supported_modes, 0xFFFFFFFF, 5),
     ):
         if expected is None or found is None:
             continue
@@ -102,10 +103,22 @@ def match(profile: DriveProfile, presented: Presented) -> Match:
     ):
         fits = False
         because.append(f"device type 0x{presented.device_type:X} is no CiA 402 drive")
-    if not because:
-        because.append("it says of every CiA 402 drive what the standard says")
+    if not any(value is not None for value in _numbers(wanted)):
+        fits = False
+        because.append("it has no number by which such a drive could be told; choose it by hand")
+    elif not because:
+        because.append("the drive gives no number to compare")
     because += obstacles(profile, presented.supported_modes)
     return Match(profile, fits, score, tuple(because))
+
+
+def _numbers(identity: Identity) -> tuple[int | None, ...]:
+    return (
+        identity.device_type,
+        identity.vendor_id,
+        identity.product_code,
+        identity.supported_modes,
+    )
 
 
 def best_matches(
@@ -151,7 +164,7 @@ def obstacles(profile: DriveProfile, supported_modes: int | None = None) -> tupl
             )
         if Mode.CYCLIC_TORQUE.value not in modes:
             found.append("it has no cyclic torque mode, so the axis can not float")
-    if isinstance(profile.torque, str):
+    if isinstance(profile.torque, str) or isinstance(profile.torque.scale, str):
         found.append("what its torque units are worth is not known, so it can not be measured")
     if profile.heartbeat_reaction == UNKNOWN:
         found.append("what it does when the host dies is not known, so it may not be moved")

@@ -13,6 +13,16 @@ GainsVia = Literal["objects", "password", "read-only", "interpreter", "none", "u
 only be read; through the drive's own language, which this tool does not speak; not at all."""
 
 
+class Condition(Part):
+    """What an object of the drive must hold for a fact of the profile to be true."""
+
+    object: Address
+    type: DataType
+    equals: int
+    missing_is_fine: bool = False
+    """Whether a drive without the object does as one whose object holds the value."""
+
+
 class ParameterInfo(Part):
     """One controller parameter: its object, and what its number means.
 
@@ -24,7 +34,8 @@ class ParameterInfo(Part):
     )
 
     object: Address
-    type: DataType
+    told_type: DataType | Unknown = Field(alias="type")
+    """The type; ``unknown``: only the drive's own EDS tells."""
     unit: str
     """Physical unit, in SI of a rotary axis."""
     factor: Positive | Unknown = Field(default=1.0, alias="scale")
@@ -33,11 +44,31 @@ class ParameterInfo(Part):
     """-1: the object holds the reciprocal, as a reset time does."""
     times: dict[str, Annotated[int, Field(ge=-3, le=3)]] = Field(default_factory=dict)
     """Quantities of the drive, or parameters that stand before this one, with their powers."""
+    only_if: Condition | None = None
+    """What must be so in the drive for the unit to be the one given."""
+    follows: str | None = None
+    """Parameter before it that it always gets the value of."""
     write: Literal["always", "disabled", "unknown"] = "disabled"
     """Whether it may be written while the drive is enabled."""
     minimum: Number | None = None
     maximum: Number | None = None
     """Range in physical units."""
+
+    @property
+    def type(self) -> DataType:
+        """The type.
+
+        Raises
+        ------
+        NotSupportedError
+            If nobody has told it yet.
+        """
+        if self.told_type == UNKNOWN:
+            raise NotSupportedError(
+                f"object {self.object}: its type is not known. Give the drive's own EDS with `eds:` at "
+                "the axis in the machine profile."
+            )
+        return self.told_type
 
     @property
     def scale(self) -> float:
@@ -96,6 +127,8 @@ class Store(Part):
     """Four letters, as 0x1010 wants them, or a number."""
     what: str = "all parameters"
     """Which parameters it stores: some drives have one sub-index for each category."""
+    duration: Seconds | Unknown = UNKNOWN
+    """How long it usually takes."""
     timeout: Seconds
     """Longest time until the drive answers."""
     verify: Literal["answer", "status", "read-back after restart"] = "answer"
