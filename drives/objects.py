@@ -215,7 +215,6 @@ FOLLOWING_ERROR_WINDOW = _standard(0x6065, 0, "UNSIGNED32", "following error win
 MAX_TORQUE = _standard(0x6072, 0, "UNSIGNED16", "max torque")
 SOFTWARE_LIMIT_LOW = _standard(0x607D, 1, "INTEGER32", "min software position limit")
 SOFTWARE_LIMIT_HIGH = _standard(0x607D, 2, "INTEGER32", "max software position limit")
-POLARITY = _standard(0x607E, 0, "UNSIGNED8", "polarity")
 MAX_PROFILE_VELOCITY = _standard(0x607F, 0, "UNSIGNED32", "max profile velocity")
 MAX_MOTOR_SPEED = _standard(0x6080, 0, "UNSIGNED32", "max motor speed")
 VELOCITY_UNIT = _standard(0x60A9, 0, "UNSIGNED32", "SI unit velocity")

@@ -4,6 +4,8 @@
 take, ``kernel_link`` and ``kernel_bus`` what only SocketCAN has, ``trouble`` reads error frames.
 """
 
+from can import BusABC as Bus
+
 from drives.bus.clock import Clock, WallClock, clock_of, not_imitated
 from drives.bus.load import (
     MAX_CYCLIC_LOAD,
@@ -16,6 +18,7 @@ from drives.bus.opening import open_bus
 
 __all__ = [
     "MAX_CYCLIC_LOAD",
+    "Bus",
     "Clock",
     "CyclicLoad",
     "WallClock",

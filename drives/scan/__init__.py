@@ -5,7 +5,7 @@ what the tool would miss in a drive, ``scanning`` puts them together.
 """
 
 from drives.scan.needs import Need
-from drives.scan.scanning import Scan, ScannedNode, scan
+from drives.scan.scanning import Scan, ScannedNode, listened, scan
 from drives.scan.traffic import Traffic
 
-__all__ = ["Need", "Scan", "ScannedNode", "Traffic", "scan"]
+__all__ = ["Need", "Scan", "ScannedNode", "Traffic", "listened", "scan"]

@@ -104,14 +104,19 @@ def _is_answer(message: can.Message) -> bool:
     return plain and 0x581 <= message.arbitration_id <= 0x5FF and len(message.data) == 8
 
 
+def node_to_ask(line: Line, node_id: int, timeout: float = ANSWER) -> Node:
+    """Return a node of which nothing is known, with a time-out for each answer in seconds."""
+    node = Node(node_id, ObjectDictionary())
+    line.add_node(node)
+    node.sdo.RESPONSE_TIMEOUT = timeout
+    return node
+
+
 class Asked:
     """One node while it is asked; each object once."""
 
-    def __init__(self, line: Line, node_id: int, timeout: float = ANSWER) -> None:
-        self.node_id = node_id
-        self._node = Node(node_id, ObjectDictionary())
-        line.add_node(self._node)
-        self._node.sdo.RESPONSE_TIMEOUT = timeout
+    def __init__(self, node: Node) -> None:
+        self._node = node
         self.answers: dict[ObjectAddress, Reading] = {}
         """What it said so far, by object."""
         self._silences = 0

@@ -13,7 +13,7 @@ from drives.errors import BusError
 from drives.objects import ObjectInfo
 from drives.profile import DriveProfile
 from drives.profile.match import Presented, best_matches
-from drives.scan.asking import IDENTITY, Asked, Reading, who_answers
+from drives.scan.asking import IDENTITY, Asked, Reading, node_to_ask, who_answers
 from drives.scan.differences import Fit, with_objects
 from drives.scan.needs import ASKED, Need, needs_of
 from drives.scan.traffic import NodeTraffic, Traffic, sorted_traffic
@@ -125,7 +125,7 @@ def scan(
         If the bus does not take or deliver frames: nobody acknowledges, or it is off.
     """
     line = Line(bus)
-    traffic = _listen(line, listen, progress)
+    traffic = listened(line, listen, progress)
     problems = list(_judged(traffic))
     may_ask = not traffic.wrong_bit_rate and (not traffic.commanded if ask is None else ask)
     found = {node.node_id: ScannedNode(node.node_id, node, answers=False) for node in traffic.nodes}
@@ -161,7 +161,10 @@ def scan(
     return Scan(traffic, tuple(found[k] for k in sorted(found)), True, tuple(problems))
 
 
-def _listen(line: Line, seconds: float, progress: Progress) -> Traffic:
+def listened(
+    line: Line, seconds: float = LISTEN, progress: Progress = lambda _what, _share: None
+) -> Traffic:
+    """Listen to a bus, and return what was heard, sorted; nothing is sent."""
     frames: list[can.Message] = []
     began = line.clock.now()
     while (gone := line.clock.now() - began) < seconds:
@@ -232,7 +235,7 @@ def _silent(node: ScannedNode) -> ScannedNode:
 def _ask_node(
     line: Line, node_id: int, heard: NodeTraffic, profiles: Mapping[str, DriveProfile]
 ) -> ScannedNode:
-    asked = Asked(line, node_id)
+    asked = Asked(node_to_ask(line, node_id))
     who = asked.read_all(IDENTITY)
     asked.read_all((*ASKED, *OWN_LIMITS))
     identity, answers = _identity(who), asked.answers

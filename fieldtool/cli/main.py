@@ -5,16 +5,12 @@ to identify; 6 write-back failed and was restored; 7 write-back failed and could
 stopped by the user, machine safe.
 """
 
-import signal
 import sys
 import tempfile
 import traceback
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from datetime import datetime
 from pathlib import Path
-from time import monotonic
-from types import FrameType
 from typing import Annotated
 
 import typer
@@ -36,6 +32,7 @@ from drives.parameters import Change
 from drives.profile import MachineProfile
 from fieldtool import workflow
 from fieldtool.cli.bus_options import Bitrate, Channel, Interface, on_bus
+from fieldtool.cli.check import check
 from fieldtool.cli.output import console_of, print_json
 from fieldtool.cli.restored import show_restored
 from fieldtool.cli.scan import scan
@@ -46,6 +43,7 @@ from fieldtool.cli.screen import (
     show_parameters,
     show_result,
 )
+from fieldtool.cli.stop_key import StopKey, may_move, stop_key
 from fieldtool.cli.tracing import TraceFile, TraceWanted, trace_path
 from fieldtool.errors import (
     FieldtoolError,
@@ -79,10 +77,6 @@ EXIT_CODES: tuple[tuple[type[Exception], int], ...] = (
     (FieldtoolError, 3),
     (DrivesError, 3),
 )
-
-ASKED_WITHIN = 0.5
-"""Seconds: a motion asks for a stop so often, at least."""
-STOPPED_AT_REST = "stopped by the user; no axis was moving, all are disabled."
 
 Machine = Annotated[str, typer.Argument(help="Name of a machine profile, or path of its file.")]
 Out = Annotated[
@@ -119,40 +113,10 @@ Motor = Annotated[
 ]
 
 
-class _StopKey:
-    """Ctrl-C asks for a stop.
-
-    While axes move, the motion asks for it in every cycle and ends in a stop of all axes; at any
-    other time the work in hand is broken off at once, and what it had changed is put back.
-    """
-
-    def __init__(self) -> None:
-        self.pressed = False
-        self._asked = -ASKED_WITHIN
-
-    def __call__(self) -> bool:
-        self._asked = monotonic()
-        return self.pressed
-
-    def on_signal(self, _number: int, _frame: FrameType | None) -> None:
-        if self.pressed:
-            return
-        self.pressed = True
-        if monotonic() - self._asked <= ASKED_WITHIN:
-            sys.stderr.write("\nStopping all axes ...\n")
-            return
-        raise UserStopError(STOPPED_AT_REST)
-
-    def check(self) -> None:
-        """Raise UserStopError if it was pressed; between two stages, with all axes disabled."""
-        if self.pressed:
-            raise UserStopError(STOPPED_AT_REST)
-
-
 class _StoppableScreen:
     """A screen at which a session ends between two stages, if the user asked for it."""
 
-    def __init__(self, screen: workflow.Screen, key: _StopKey) -> None:
+    def __init__(self, screen: workflow.Screen, key: StopKey) -> None:
         self._screen, self._key = screen, key
         self.say, self.plan, self.progress = screen.say, screen.plan, screen.progress
         self.ready, self.found, self.designed = screen.ready, screen.found, screen.designed
@@ -161,18 +125,6 @@ class _StoppableScreen:
     def stage(self, title: str) -> None:
         self._key.check()
         self._screen.stage(title)
-
-
-@contextmanager
-def _stop_key() -> Iterator[_StopKey]:
-    key = _StopKey()
-    before = signal.signal(signal.SIGINT, key.on_signal)
-    before_term = signal.signal(signal.SIGTERM, key.on_signal)
-    try:
-        yield key
-    finally:
-        signal.signal(signal.SIGINT, before)
-        signal.signal(signal.SIGTERM, before_term)
 
 
 def _folder(out: Path | None, name: str) -> Path:
@@ -208,7 +160,7 @@ def _options(
 
 
 def _asker(
-    console: Console, yes: bool, key: _StopKey, store: bool
+    console: Console, yes: bool, key: StopKey, store: bool
 ) -> Callable[[Sequence[Change]], bool]:
     def ask(changes: Sequence[Change]) -> bool:
         key.check()
@@ -225,13 +177,6 @@ def _asker(
         return typer.confirm(f"Write these parameters into the drives' {where}?", err=True)
 
     return ask
-
-
-def _may_move(yes: bool) -> Callable[[str], bool] | None:
-    """Return how to ask a person before the machine moves; None where nobody has to be asked."""
-    if yes or not sys.stdin.isatty():
-        return None
-    return lambda sentence: typer.confirm(f"{sentence}\nMove the machine now?", err=True)
 
 
 @app.command()
@@ -263,7 +208,7 @@ def run(
         profile = on_bus(machine, interface, channel, bitrate)
         _show_plan(profile, options, console, as_json)
         return
-    with _stop_key() as key, TerminalScreen(console, _may_move(yes)) as screen:
+    with stop_key() as key, TerminalScreen(console, may_move(yes)) as screen:
         result = workflow.run(
             on_bus(machine, interface, channel, bitrate),
             folder,
@@ -333,7 +278,7 @@ def measure(
         profile = on_bus(machine, interface, channel, bitrate)
         _show_plan(profile, options, console, as_json)
         return
-    with _stop_key() as key, TerminalScreen(console, _may_move(yes)) as screen:
+    with stop_key() as key, TerminalScreen(console, may_move(yes)) as screen:
         seconds = workflow.measure(
             on_bus(machine, interface, channel, bitrate),
             folder,
@@ -466,7 +411,7 @@ def write(
     console = console_of(False)
     traced = trace_path(trace, trace_file, folder)
     options = workflow.Options(write=True, store=store, trace=traced)
-    with _stop_key() as key, TerminalScreen(console) as screen:
+    with stop_key() as key, TerminalScreen(console) as screen:
         stoppable = _StoppableScreen(screen, key)
         ask = _asker(console, yes, key, store)
         profile = on_bus(folder / "machine.yaml", interface, channel, bitrate)
@@ -502,7 +447,7 @@ def restore(
     if machine is None:
         machine = str(folder / "machine.yaml")
     traced = trace_path(trace, trace_file, folder)
-    with _stop_key():
+    with stop_key():
         profile = on_bus(machine, interface, channel, bitrate)
         restored = workflow.restore(profile, backup, store, traced, same_drives)
     show_restored(console_of(as_json), restored)
@@ -540,13 +485,14 @@ def simulate(
 ) -> None:
     """Serve the simulated machine's nodes in real time on a bus, until Ctrl-C."""
     console = console_of(False)
-    with _stop_key() as key:
+    with stop_key() as key:
         profile = on_bus(machine, interface, channel, bitrate)
         served = workflow.simulate(profile, key, console.print)
     console.print(served)
 
 
 app.command()(scan)
+app.command()(check)
 
 
 def _lengths(masses: Sequence[str]) -> dict[str, int]:

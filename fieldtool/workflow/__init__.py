@@ -4,6 +4,7 @@ This is the only place that knows all stages, and, with criticism, the only one 
 simulation may stand behind the bus.
 """
 
+from fieldtool.workflow.checking import CheckResult, check
 from fieldtool.workflow.fast_measuring import plan
 from fieldtool.workflow.models import prior_model, truth_model
 from fieldtool.workflow.next_plan import next_plan
@@ -18,10 +19,12 @@ from fieldtool.workflow.session import (
 from fieldtool.workflow.stages import draw, identify, measure, redesign, restore, run, write
 
 __all__ = [
+    "CheckResult",
     "Options",
     "Quiet",
     "Screen",
     "SessionResult",
+    "check",
     "compare",
     "draw",
     "export_folder",

@@ -74,7 +74,7 @@ def plan(
         setting = setting_of(profile, group, prior_model(profile))
         cycle_time = fast_cycle_times(setting.model, group.shortest_cycle)[0]
         times = timing(setting, options.excitation_time or usual_seconds(setting.model))
-        planned, _ = _planned_before(group, setting, cycle_time, times)
+        planned, _ = planned_before(group, setting, cycle_time, times)
     if screen is not None:
         for note in _longer_than_asked(planned, options.excitation_time):
             screen.say(note)
@@ -82,7 +82,7 @@ def plan(
     return planned
 
 
-def _planned_before(
+def planned_before(
     group: CanopenGroup, setting: Setting, cycle_time: float, times: Timing
 ) -> tuple[PlannedFast, MultisinePlan]:
     """Plan with the prior model, before anything has moved; return it all, and the pilot."""
@@ -190,7 +190,7 @@ class _Measurement:
         """Plan with the prior model, and show it; nothing has moved yet."""
         screen = self._session.screen
         screen.stage("Plan pilot and main experiments with the machine as last accepted")
-        planned, pilot = _planned_before(self._group, self._setting, cycle_time, self._times)
+        planned, pilot = planned_before(self._group, self._setting, cycle_time, self._times)
         for note in _longer_than_asked(planned, self._asked):
             self._session.warn(note)
         screen.fast_plan(planned)

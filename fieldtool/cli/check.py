@@ -1,0 +1,110 @@
+"""``fieldtool check``: a table of pass, warn, fail before the first motion."""
+
+import sys
+from datetime import datetime
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from fieldtool import workflow
+from fieldtool.cli.bus_options import Bitrate, Channel, Interface, on_bus
+from fieldtool.cli.output import console_of, print_json
+from fieldtool.cli.stop_key import stop_key
+from fieldtool.cli.tracing import TraceFile, TraceWanted, trace_path
+from fieldtool.experiment.checks.finding import Finding, Status
+from fieldtool.workflow.checking import CheckResult, unit_of, way_of
+
+STYLES: dict[Status, str] = {
+    "pass": "green",
+    "warn": "yellow",
+    "fail": "bold red",
+    "not tried": "dim",
+}
+FAILED, STOPPED = 3, 4
+"""Exit codes: refused before motion; stopped for safety."""
+
+
+def check(
+    machine: Annotated[str, typer.Argument(help="Name of a machine profile, or path of its file.")],
+    move: Annotated[
+        bool | None,
+        typer.Option(
+            "--move/--no-move", help="Move every axis a little, or none; asked otherwise."
+        ),
+    ] = None,
+    yes: Annotated[bool, typer.Option("--yes", help="Move without asking.")] = False,
+    interface: Interface = None,
+    channel: Channel = None,
+    bitrate: Bitrate = None,
+    trace: TraceWanted = False,
+    trace_file: TraceFile = None,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print one JSON object and nothing else.")
+    ] = False,
+) -> None:
+    """Check a machine before its first motion. MOVES EVERY AXIS A LITTLE, if you say so."""
+    profile = on_bus(machine, interface, channel, bitrate)
+    console = console_of(as_json)
+    folder = Path("sessions") / f"check-{Path(machine).stem}-{datetime.now():%Y%m%d-%H%M%S}"
+    traced = trace_path(trace, trace_file, folder)
+    if traced is not None and trace_file is None:
+        folder.mkdir(parents=True, exist_ok=True)
+
+    def may_move() -> bool:
+        if move is not None:
+            return move
+        if yes:
+            return True
+        if not sys.stdin.isatty():
+            return False
+        axes = ", ".join(f"{a.name} by {way_of(a):.2g} {unit_of(a)}" for a in profile.axes)
+        return typer.confirm(
+            f"Now every axis is enabled and moves a little and back: {axes}. Keep clear of the "
+            "machine.\nMove the axes now?",
+            err=True,
+        )
+
+    with stop_key() as key:
+        result = workflow.check(
+            profile,
+            may_move=may_move,
+            stop_requested=key,
+            trace=traced,
+            say=lambda text: console.print(Text(f"▶ {text}", style="bold")),
+        )
+    show(console, result)
+    if traced is not None:
+        console.print(Text(f"Every frame is in {traced}."))
+    if as_json:
+        print_json(result.as_dict())
+    if result.verdict == "fail":
+        sys.exit(STOPPED if result.stopped else FAILED)
+
+
+def show(console: Console, result: CheckResult) -> None:
+    """Show all findings, those of the machine first, then axis by axis, and the summary."""
+    table = Table(box=None, padding=(0, 1), show_edge=False)
+    for title in ("", "check", "found, and what to do"):
+        table.add_column(title, overflow="fold")
+    axes = list(dict.fromkeys(one.axis for one in result.findings))
+    for axis in sorted(axes, key=bool):
+        if axis:
+            table.add_row("", "", "")
+            table.add_row("", Text(axis, style="bold"), "")
+        for one in result.findings:
+            if one.axis == axis:
+                table.add_row(*_row(one))
+    console.print(table)
+    style = STYLES[result.verdict]
+    console.print(Text(result.sentence, style=style))
+
+
+def _row(one: Finding) -> tuple[Text, Text, Text]:
+    found = Text(one.found)
+    if one.todo:
+        found.append(f"\n→ {one.todo}", style=STYLES[one.status])
+    return Text(one.status, style=STYLES[one.status]), Text(one.check), found

@@ -1,0 +1,68 @@
+"""Ctrl-C as a request to stop, and the question before anything moves."""
+
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from time import monotonic
+from types import FrameType
+
+import typer
+
+from drives.errors import UserStopError
+
+ASKED_WITHIN = 0.5
+"""Seconds: a motion asks for a stop so often, at least."""
+STOPPED_AT_REST = "stopped by the user; no axis was moving, all are disabled."
+
+
+class StopKey:
+    """Ctrl-C asks for a stop.
+
+    While axes move, the motion asks for it in every cycle and ends in a stop of all axes; at any
+    other time the work in hand is broken off at once, and what it had changed is put back.
+    """
+
+    def __init__(self) -> None:
+        self.pressed = False
+        self._asked = -ASKED_WITHIN
+
+    def __call__(self) -> bool:
+        """Return whether it was pressed; a motion asks in every cycle."""
+        self._asked = monotonic()
+        return self.pressed
+
+    def on_signal(self, _number: int, _frame: FrameType | None) -> None:
+        """Note the key; with no motion to end, end what is being done now."""
+        if self.pressed:
+            return
+        self.pressed = True
+        if monotonic() - self._asked <= ASKED_WITHIN:
+            sys.stderr.write("\nStopping all axes ...\n")
+            return
+        raise UserStopError(STOPPED_AT_REST)
+
+    def check(self) -> None:
+        """Raise UserStopError if it was pressed; between two stages, with all axes disabled."""
+        if self.pressed:
+            raise UserStopError(STOPPED_AT_REST)
+
+
+@contextmanager
+def stop_key() -> Iterator[StopKey]:
+    """Make Ctrl-C, and the request to end, a request to stop, for as long as this lasts."""
+    key = StopKey()
+    before = signal.signal(signal.SIGINT, key.on_signal)
+    before_term = signal.signal(signal.SIGTERM, key.on_signal)
+    try:
+        yield key
+    finally:
+        signal.signal(signal.SIGINT, before)
+        signal.signal(signal.SIGTERM, before_term)
+
+
+def may_move(yes: bool) -> Callable[[str], bool] | None:
+    """Return how to ask a person before the machine moves; None where nobody has to be asked."""
+    if yes or not sys.stdin.isatty():
+        return None
+    return lambda sentence: typer.confirm(f"{sentence}\nMove the machine now?", err=True)

@@ -1,0 +1,136 @@
+"""Check a machine by tiny moves; whatever happens, all axes are off afterwards, and all is put back."""
+
+from collections.abc import Callable
+
+from drives.bus import Bus, clock_of
+from drives.bus.clock import WallClock
+from drives.canopen_drive import CanopenGroup, connect
+from drives.errors import DrivesError, SafetyStopError, UserStopError
+from drives.profile import MachineProfile
+from fieldtool.errors import FieldtoolError, PlanRefusedError
+from fieldtool.experiment.axes import Axes
+from fieldtool.experiment.checks.finding import Findings
+from fieldtool.experiment.checks.motion import judged_moves
+from fieldtool.experiment.directions import check_directions
+from fieldtool.experiment.forecast import Setting
+from fieldtool.records.recording import Experiment
+from fieldtool.workflow.fast_measuring import planned_before
+from fieldtool.workflow.models import prior_model
+from fieldtool.workflow.planning import timing, usual_seconds
+from fieldtool.workflow.preparation import axes_of, setting_of
+
+ROOM = "room for the sweeps"
+MOVE_CHECKS = (ROOM, "direction", "brake and friction", "load at rest")
+"""Names of what is checked by moving."""
+
+
+class MoveChecks:
+    """The tiny moves of one machine.
+
+    Parameters
+    ----------
+    machine
+        Its profile.
+    findings
+        Where what is found goes.
+    cycle_time
+        Seconds from SYNC to SYNC.
+    say
+        Is told what is done.
+    """
+
+    def __init__(
+        self,
+        machine: MachineProfile,
+        findings: Findings,
+        cycle_time: float,
+        say: Callable[[str], None],
+    ) -> None:
+        self._machine, self._findings = machine, findings
+        self._cycle_time, self._say = cycle_time, say
+        self.moved = False
+        """Whether axes were enabled."""
+        self.stopped = False
+        """Whether a safety stop ended it."""
+
+    def run(self, bus: Bus, stop_requested: Callable[[], bool]) -> None:
+        """Plan, move, judge; what goes wrong is a finding.
+
+        Raises
+        ------
+        UserStopError
+            If the user asked to stop; all axes are disabled.
+        """
+        try:
+            with connect(self._machine, bus, stop_requested) as group:
+                try:
+                    self._plan_and_move(group)
+                finally:
+                    for text in group.warnings:
+                        todo = "Switch the drive off and on."
+                        self._findings.note("put back", "fail", text, todo=todo)
+                    self._pace(group, bus)
+        except UserStopError:
+            raise
+        except SafetyStopError as error:
+            self.stopped = True
+            self._ended(error, error.axis or "")
+        except (DrivesError, FieldtoolError) as error:
+            self._ended(error, "")
+
+    def _plan_and_move(self, group: CanopenGroup) -> None:
+        kept: list[Experiment] = []
+        with group.without_feed_forward():
+            setting = setting_of(self._machine, group, prior_model(self._machine))
+            axes: Axes = axes_of(group, setting)
+            self._say("Plan a measurement")
+            self._room(group, setting)
+            self._say("Move every axis a little, and back")
+            self.moved = True
+            check_directions(group, axes, self._cycle_time, kept.append)
+        units = [drive.position_unit for drive in group.drives]
+        torque_units = [drive.torque_unit for drive in group.drives]
+        self._findings.add(judged_moves(kept, axes.names, axes.limits, units, torque_units))
+        if not group.warnings:
+            found = "all axes are disabled, every object is what it was"
+            self._findings.note("put back", "pass", found)
+
+    def _room(self, group: CanopenGroup, setting: Setting) -> None:
+        """Plan the measurement that would follow, and show how much of the travel it needs."""
+        times = timing(setting, usual_seconds(setting.model))
+        try:
+            planned, _ = planned_before(group, setting, self._cycle_time, times)
+        except PlanRefusedError as error:
+            self._findings.note(ROOM, "warn", f"no measurement can be planned: {error}")
+            return
+        for drive, way in zip(group.drives, planned.moves, strict=True):
+            low, high = drive.limits.travel
+            self._findings.note(
+                ROOM,
+                "pass",
+                f"a measurement moves it by ±{way.excursion:.3g} {drive.position_unit} around "
+                f"{(low + high) / 2:.3g}; the travel is ±{(high - low) / 2:.3g}",
+                drive.axis,
+            )
+
+    def _ended(self, error: Exception, axis: str) -> None:
+        text = str(error).removeprefix(f"{axis}: ") if axis else str(error)
+        notes = " ".join(getattr(error, "__notes__", ()))
+        self._findings.note("direction", "fail", f"{text} {notes}".strip(), axis)
+        for other in self._machine.axes:
+            if other.name != axis:
+                why = "the moves ended before"
+                self._findings.note("direction", "not tried", why, other.name)
+
+    def _pace(self, group: CanopenGroup, bus: Bus) -> None:
+        if not isinstance(clock_of(bus), WallClock):
+            return
+        late = group.late_cycles
+        self._findings.note(
+            "cycle time",
+            "warn" if late else "pass",
+            f"{late} cycles began late while the axes moved",
+            todo="Close other programs; blocks with late cycles are measured again."
+            if late
+            else "",
+        )
