@@ -76,10 +76,34 @@ def folded_phasors(
             continue
         # A target sent with one SYNC is reached at the next one.
         reached = reference[:, axis] * np.exp(-1j * omega * period)
-        place = min(lag / period, 1.0)
-        lost = (omega * period) ** 2 / 12 * (1 - 6 * place * (1 - place))
+        lost = (omega * period) ** 2 * _lost(lag, period)
         folded[:, axis] = controller.velocity_p * controller.position_p * reached * lost
     return folded
+
+
+def folded_course(recording: Recording, experiment: Experiment) -> FloatArray:
+    """Return the part of sampled torques that is folded images row by row, (n, M), N m or N.
+
+    The same as :func:`folded_phasors` for motion that does not repeat: (w T)^2 times a sine is what its
+    targets bend from one SYNC to the next.
+    """
+    period, reference = recording.sample_period, experiment.position_reference
+    folded = np.zeros(experiment.torque.shape)
+    if reference is None:
+        return folded
+    for axis, information in enumerate(recording.axes):
+        lag, controller = lags(recording).get(information.name), information.controller
+        if lag is None or controller is None or np.any(np.isnan(reference[:, axis])):
+            continue
+        gain = controller.velocity_p * controller.position_p * _lost(lag, period)
+        folded[2:, axis] = -gain * np.diff(reference[:, axis], 2)
+    return folded
+
+
+def _lost(lag: float, period: float) -> float:
+    """Share of what a target bends by that a torque sampled so much later shows."""
+    place = min(lag / period, 1.0)
+    return (1 - 6 * place * (1 - place)) / 12
 
 
 def held_offset(

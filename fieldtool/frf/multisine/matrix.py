@@ -57,12 +57,17 @@ class JointResult:
     """Condition ``solved``, at the excited lines, with covariance."""
     freedom: FloatArray
     """(F,): complex degrees of freedom behind the covariance."""
-    phasors: tuple[Phasors, ...]
-    """Of each experiment at its excited lines, transients and folded images taken off."""
+    lines: tuple[LinePhasors, ...]
+    """Of each experiment, transients and folded images taken off."""
     distortion: tuple[AxisDistortion, ...]
     """Per axis and amplitude level; empty where no line was left out for detection."""
     notes: tuple[str, ...]
     """What a technician should know, one sentence each."""
+
+    @property
+    def phasors(self) -> tuple[Phasors, ...]:
+        """Of each experiment at its excited lines."""
+        return tuple(one.phasors(self.response.axes) for one in self.lines)
 
 
 def joint_response(
@@ -112,8 +117,7 @@ def joint_response(
         *mean.notes,
         *(one.sentence for one in distortion if one.worth_saying),
     )
-    phasors = tuple(one.phasors(recording.names) for one in measured)
-    return JointResult(mean.response, mean.freedom, phasors, distortion, notes)
+    return JointResult(mean.response, mean.freedom, tuple(measured), distortion, notes)
 
 
 def _chosen(recording: Recording) -> list[Experiment]:
@@ -130,12 +134,10 @@ def _notes(measured: Sequence[LinePhasors], left_out: int) -> list[str]:
     few = min(one.given.periods for one in measured) < _ENOUGH
     allowed = _TOO_MUCH_OF_FEW if few else _TOO_MUCH
     if largest > allowed and not any(_drifts(one.given.experiment) for one in measured):
-        price = (
-            "errors may be larger than their intervals say" if few else "intervals are wider for it"
-        )
+        bands = "may be too narrow" if few else "are wider for it"
         notes.append(
-            f"Transients of up to {100 * largest:.0f} % of the signals were taken out: {price}. More "
-            "time (--time) would lessen them."
+            f"Transients of up to {100 * largest:.0f} % of the signals were taken out of the responses, "
+            f"whose bands {bands}. More time (--time) would lessen them."
         )
     if left_out:
         notes.append(

@@ -142,17 +142,29 @@ def noise_covariance(
     products = np.concatenate([np.zeros((1, *products.shape[1:])), np.cumsum(products, axis=0)])
     counts = np.concatenate([[0.0], np.cumsum(spectra.freedom)]) * len(columns)
     lines = np.arange(1, spectra.mean.shape[0] + 1)
-    low, high = _windows(spectra.place, counts, lines, wanted)
+    low, high = windows(spectra.place, counts, lines, wanted)
     freedom = counts[high] - counts[low]
     mean = (products[high] - products[low]) / freedom[:, None, None]
     return mean * spectra.inflation[:, None, None], freedom
 
 
-def _windows(
-    place: FloatArray, counts: FloatArray, lines: NDArray[np.intp], wanted: float
+def windows(
+    place: FloatArray, counts: FloatArray, lines: NDArray[np.intp] | FloatArray, wanted: float
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return for each line the bins from, to (not included) of the narrowest window that will do."""
-    low, high = np.empty_like(lines), np.empty_like(lines)
+    """Return for each line the bins from, to (not included) of the narrowest window that will do.
+
+    Parameters
+    ----------
+    place
+        (B,): where bins are, rising.
+    counts
+        (B + 1,): sums of the degrees of freedom of all bins before.
+    lines
+        (L,): where the windows are centred, in the unit of ``place``.
+    wanted
+        Degrees of freedom; a window that would need more bins than there are holds all of them.
+    """
+    low, high = np.empty(len(lines), np.intp), np.empty(len(lines), np.intp)
     for at, line in enumerate(lines):
         distance = np.unique(np.abs(place - line))
         a, b = 0, distance.size - 1

@@ -24,21 +24,48 @@ class Fit:
     """Shape (P,)."""
     jacobian: FloatArray
     """Of the residuals in standard errors, shape (measured, P)."""
-    chi2: float
-    """Sum of squared residuals; near its degrees of freedom if model and noise are right."""
+    residuals: FloatArray
+    """In standard errors, shape (measured,)."""
+    eliminated: int = 0
+    """Measured numbers that unknowns beside the parameters used up."""
+
+    @property
+    def chi2(self) -> float:
+        """Sum of squared residuals; near its degrees of freedom if model and noise are right."""
+        return float(self.residuals @ self.residuals)
 
     @property
     def degrees_of_freedom(self) -> int:
-        """Measured numbers minus parameters, at least 1."""
-        return max(int(self.jacobian.shape[0]) - int(self.x.size), 1)
+        """Measured numbers minus unknowns, at least 1."""
+        return max(int(self.jacobian.shape[0]) - int(self.x.size) - self.eliminated, 1)
 
     @property
     def excess(self) -> float:
         """Factor on variances where the misfit is larger than the noise explains, at least 1."""
         return max(1.0, self.chi2 / self.degrees_of_freedom)
 
-    def covariance(self) -> FloatArray:
-        """Of x, shape (P, P), enlarged by :attr:`excess`; infinite variance where nothing is known."""
+    @cached_property
+    def felt_excess(self) -> float:
+        """As :attr:`excess`, but that of the numbers that the parameters rest on, where it is larger.
+
+        Each counts by its leverage, so that many that say little can not hide the others.
+        """
+        rows = self.jacobian.shape[0]
+        scale = np.linalg.norm(self.triangle, axis=0)
+        scale[scale == 0.0] = 1.0
+        _, singular, turn = np.linalg.svd(self.triangle / scale, full_matrices=False)
+        known = singular > singular.max(initial=0.0) * self._smallest
+        if not np.any(known):
+            return self.excess
+        unit = (self.jacobian / scale) @ (turn[known].T / singular[known])
+        leverage = np.minimum(np.einsum("rp,rp->r", unit, unit), 1.0)
+        expected = float(leverage @ (1.0 - leverage)) * max(1.0 - self.eliminated / rows, 1e-9)
+        counted = float(leverage @ self.residuals**2) / expected if expected > 0.0 else 0.0
+        return max(self.excess, counted)
+
+    def covariance(self, excess: float | None = None) -> FloatArray:
+        """Of x, shape (P, P), enlarged by :attr:`excess` or as given; infinite where nothing is told."""
+        enlarged = self.excess if excess is None else excess
         scale = np.linalg.norm(self.triangle, axis=0)
         scale[scale == 0.0] = 1.0
         _, singular, rows = np.linalg.svd(self.triangle / scale)
@@ -49,7 +76,7 @@ class Fit:
             covariance = inverse @ inverse.T
             lost = np.any(np.abs(rows[~known]) > 1e-6, axis=0)
             covariance[lost, lost] = np.inf
-            result: FloatArray = covariance / np.outer(scale, scale) * self.excess
+            result: FloatArray = covariance / np.outer(scale, scale) * enlarged
         return result
 
     @cached_property
@@ -95,12 +122,12 @@ def damped_fit(
 ) -> Fit:
     """As :func:`fit`, but content where a step would lower the sum of squares by this share of it."""
     x = np.array(start, dtype=np.float64)
-    cost = 0.0
+    left = np.zeros(0)
     for floor in floors:
         exact = floor == 0.0
         limit = evaluations if exact else min(evaluations, 30)
-        x, cost = _descend(residuals, jacobian, x, floor, limit, tolerance if exact else 1e-2)
-    return Fit(x, jacobian(x, floors[-1]), cost)
+        x, left = _descend(residuals, jacobian, x, floor, limit, tolerance if exact else 1e-2)
+    return Fit(x, jacobian(x, floors[-1]), left)
 
 
 def _descend(
@@ -110,8 +137,8 @@ def _descend(
     floor: float,
     evaluations: int,
     tolerance: float,
-) -> tuple[FloatArray, float]:
-    """Return the parameters and their sum of squares."""
+) -> tuple[FloatArray, FloatArray]:
+    """Return the parameters and the residuals there."""
     r = residuals(x, floor)
     cost, damping, growth = float(r @ r), FIRST_DAMPING, 4.0
     size = np.zeros(x.size)
@@ -135,7 +162,7 @@ def _descend(
         expected = -float(step @ (2.0 * gradient + normal @ step))
         if expected <= tolerance * cost:
             if np.isfinite(lower) and lower < cost:
-                x, cost = x + step, lower
+                x, r = x + step, tried
             break
         moved = bool(np.isfinite(lower) and lower < cost)
         if moved:
@@ -147,7 +174,7 @@ def _descend(
             damping, growth = damping * growth, 2.0 * growth
         if damping > 1e12:
             break
-    return x, cost
+    return x, r
 
 
 def fit(

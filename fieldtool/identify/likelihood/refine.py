@@ -11,7 +11,7 @@ larger than the noise (chi2 well above its degrees of freedom), and then enlarge
 errors, but are not modelled.
 """
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import inf
 
@@ -20,19 +20,20 @@ from numpy.typing import NDArray
 
 from fieldtool.errors import IdentificationError, NotEnoughDataError
 from fieldtool.identify.likelihood.joint_data import JointSpectra
-from fieldtool.identify.likelihood.least_squares import Fit, fit, standard_errors
+from fieldtool.identify.likelihood.least_squares import GENTLE_START, Fit, fit, standard_errors
 from fieldtool.identify.likelihood.parameters import (
     Parameter,
     machine_parameters,
     parameter_values,
     with_values,
 )
+from fieldtool.identify.likelihood.record_data import RecordData
 from fieldtool.identify.likelihood.response_data import ResponseMatrix
 from fieldtool.records.model import Estimate, MachineModel
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
-Measured = ResponseMatrix | JointSpectra
+Measured = ResponseMatrix | JointSpectra | RecordData
 FURTHEST = 12.0
 """Natural logarithm of the largest change from the start that a fit may try."""
 UNKNOWN_ABOVE = 0.5
@@ -111,15 +112,16 @@ def refine(
     fit_load_friction: bool = False,
     delays: Collection[float] | None = None,
 ) -> RefinedModel:
-    """Fit a machine's parameters to frequency responses.
+    """Fit a machine's parameters to frequency responses, or to spectra of positions and torques.
 
     Parameters
     ----------
     start : MachineModel
         Where to begin, e.g. from order reduction.  Its chain lengths and its list of couplings
         are kept.  Without dampers, 1 % of critical is the start.
-    data : ResponseMatrix or JointSpectra
-        Same axes in the same order.
+    data : ResponseMatrix, JointSpectra or RecordData
+        Same axes in the same order.  Spectra of whole records need a start that is near: they are
+        fitted by their own noise from the first step.
     fixed : names
         Parameters that keep their start value.
     priors : mapping of name to Estimate, optional
@@ -148,14 +150,43 @@ def refine(
         "load_friction": fit_load_friction,
     }
     kept = {kind for kind, wanted in fitted.items() if not wanted}
-    problem = _Problem.build(start, data, set(fixed), dict(priors or {}), kept, delays)
+    whole = data if isinstance(data, RecordData) else _ByResponse(data)
+    problem = _Problem.build(start, whole, set(fixed), dict(priors or {}), kept, delays)
     if data.count + len(problem.priors) < len(problem.free):
         raise NotEnoughDataError(
             f"{data.count} measured numbers can not give {len(problem.free)} parameters; "
             "measure more frequencies or fix some parameters"
         )
-    solution = fit(problem.residuals, problem.jacobian, np.zeros(len(problem.free)))
-    return problem.result(solution)
+    floors = (0.0,) if isinstance(data, RecordData) else GENTLE_START
+    solution = fit(problem.residuals, problem.jacobian, np.zeros(len(problem.free)), floors)
+    return problem.result(replace(solution, eliminated=whole.eliminated(start)))
+
+
+@dataclass(frozen=True, eq=False)
+class _ByResponse:
+    """Data that see of a machine nothing but its response matrix."""
+
+    data: ResponseMatrix | JointSpectra
+
+    @property
+    def omega(self) -> FloatArray:
+        return self.data.omega
+
+    def eliminated(self, _model: MachineModel) -> int:
+        return 0
+
+    def residuals(self, model: MachineModel, delays: FloatArray, floor: float) -> FloatArray:
+        return self.data.residuals(machine_response(model, self.data.omega, delays), floor)
+
+    def jacobian(
+        self,
+        model: MachineModel,
+        delays: FloatArray,
+        parameters: Sequence[Parameter],
+        floor: float,
+    ) -> FloatArray:
+        derivatives = response_derivatives(model, self.data.omega, delays, parameters)
+        return self.data.jacobian(derivatives, floor)
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,7 +194,7 @@ class _Problem:
     """The fit in scaled units: x = 0 is the start, and 1 a relative change of 1."""
 
     start: MachineModel
-    data: Measured
+    data: _ByResponse | RecordData
     parameters: tuple[Parameter, ...]
     initial: FloatArray
     free: NDArray[np.intp]
@@ -174,7 +205,7 @@ class _Problem:
     def build(
         cls,
         start: MachineModel,
-        data: Measured,
+        data: _ByResponse | RecordData,
         fixed: set[str],
         priors: dict[str, Estimate],
         kept_kinds: set[str],
@@ -227,15 +258,14 @@ class _Problem:
     def residuals(self, x: FloatArray, floor: float) -> FloatArray:
         values = self.values(x)
         model, delays = with_values(self.start, self.parameters, values)
-        response = machine_response(model, self.data.omega, delays)
-        return np.concatenate([self.data.residuals(response, floor), self._prior_residuals(values)])
+        measured = self.data.residuals(model, delays, floor)
+        return np.concatenate([measured, self._prior_residuals(values)])
 
     def jacobian(self, x: FloatArray, floor: float) -> FloatArray:
         values = self.values(x)
         model, delays = with_values(self.start, self.parameters, values)
         parameters = [self.parameters[k] for k in self.free]
-        derivatives = response_derivatives(model, self.data.omega, delays, parameters)
-        measured = self.data.jacobian(derivatives * self.steps(values), floor)
+        measured = self.data.jacobian(model, delays, parameters, floor) * self.steps(values)
         rows = np.zeros((len(self.priors), self.free.size))
         for row, (where, estimate) in enumerate(self.priors):
             p = parameters[where]
@@ -257,7 +287,7 @@ class _Problem:
     def result(self, solution: Fit) -> RefinedModel:
         values = self.values(solution.x)
         steps = self.steps(values)
-        scaled = solution.covariance()
+        scaled = solution.covariance(solution.felt_excess)
         covariance = scaled * np.outer(steps, steps)
         std = np.full(values.size, np.nan)
         std[self.free] = standard_errors(covariance)
@@ -324,7 +354,7 @@ def _open_directions(
     _, singular, rows = np.linalg.svd(solution.triangle, full_matrices=False)
     found = []
     for s, row in zip(singular, rows, strict=True):
-        relative = np.sqrt(solution.excess) / s if s > 0.0 else inf
+        relative = np.sqrt(solution.felt_excess) / s if s > 0.0 else inf
         involved = np.flatnonzero((np.abs(row) > 0.3) & logarithmic)
         if relative > UNKNOWN_ABOVE and involved.size > 1:
             names = tuple(parameters[k].name for k in involved)

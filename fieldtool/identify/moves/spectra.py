@@ -288,9 +288,8 @@ class _Problem:
     ) -> RefinedModel:
         values, count = self.values(solution.x), len(self.parameters)
         steps = self.steps(values)
-        freedom = max(solution.degrees_of_freedom - states, 1)
-        enlarged = max(1.0, solution.chi2 / freedom) / solution.excess
-        covariance = solution.covariance() * enlarged
+        solution = replace(solution, eliminated=states)
+        covariance = solution.covariance()
         if robust:
             covariance = self._robust(solution, covariance)
         covariance = covariance * np.outer(steps, steps)
@@ -315,7 +314,7 @@ class _Problem:
             values[self.free],
             covariance,
             solution.chi2,
-            freedom,
+            solution.degrees_of_freedom,
             self._unknown(names, values[self.free], standard_errors(covariance)),
         )
 

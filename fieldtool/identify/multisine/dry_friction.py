@@ -26,6 +26,8 @@ FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 VELOCITY_BAND = 3.0
 """Velocity is taken from the position's lines up to so many times the highest excited one."""
+SEEN = 5.0
+"""Standard errors from which dry friction is taken off before a fit."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,6 +166,25 @@ def _sign_lines(experiment: Experiment, step: float, band: tuple[float, float]) 
     velocity += _drift(experiment, step)
     lines: ComplexArray = np.fft.rfft(np.sign(velocity), axis=0)[1 : count // 2] * (2 / count)
     return lines
+
+
+def signs_of_velocity(experiment: Experiment, step: float, highest: float) -> FloatArray:
+    """Return the sign of each motor's velocity in every row, shape (n, M), whatever moves it.
+
+    The velocity is that of frequencies up to ``VELOCITY_BAND`` times `highest`, Hz; beyond its ends
+    the record goes on mirrored in its first and last point.
+    """
+    position = experiment.position - experiment.position[0]
+    turned = 2.0 * position[-1] - position[-2::-1]
+    there_and_back = np.concatenate([position, turned])[:-1]  # rises by twice the last value
+    count = there_and_back.shape[0]
+    rise = 2.0 * position[-1] / count
+    spectrum = np.fft.rfft(there_and_back - np.outer(np.arange(count), rise), axis=0)
+    frequencies = np.arange(spectrum.shape[0]) / (count * step)
+    spectrum[frequencies > VELOCITY_BAND * highest] = 0.0
+    velocity = np.fft.irfft(2j * np.pi * frequencies[:, None] * spectrum, count, axis=0)
+    signs: FloatArray = np.sign(velocity + rise / step)[: position.shape[0]]
+    return signs
 
 
 def _drift(experiment: Experiment, step: float) -> FloatArray:

@@ -15,7 +15,7 @@ import numpy as np
 from fieldtool.errors import IdentificationError
 from fieldtool.frf.from_matrix import locked_responses
 from fieldtool.frf.multisine.inputs import joint_input, with_lines
-from fieldtool.frf.multisine.lines import line_phasors
+from fieldtool.frf.multisine.lines import LinePhasors, line_phasors
 from fieldtool.frf.multisine.matrix import JointResult, joint_response
 from fieldtool.frf.phasors import Phasors
 from fieldtool.frf.response import FrequencyResponse
@@ -30,18 +30,20 @@ from fieldtool.identify.modes.fit import fit_modes
 from fieldtool.identify.modes.model import ModalModel
 from fieldtool.identify.modes.search import find_modes
 from fieldtool.identify.multisine.dry_friction import (
+    SEEN,
     DryFriction,
     dry_friction,
     without_dry_friction,
 )
 from fieldtool.identify.multisine.records import check_alive, moving_on, settled, with_periods
+from fieldtool.identify.multisine.whole_records import WholeRecords
 from fieldtool.records.model import Estimate, Kind, MachineModel
 from fieldtool.records.recording import Experiment, Recording
 
 WEIGHTINGS = 2
 """Fits, each weighted with the response of the one before."""
-SEEN = 5.0
-"""Standard errors from which dry friction is taken off, and a delay is reported."""
+DELAY_SEEN = 5.0
+"""Standard errors from which a delay is reported."""
 DELAY_SHARE = 0.05
 """Of the sample period: a smaller delay between torque and position is one of sampling, no effect."""
 FRICTION_ROUNDS = 3
@@ -111,7 +113,7 @@ def identify_joint(
     used = moving_on(recording)
     complete, single = _sets(used)
     measured = joint_response(used, complete)
-    phasors = (*measured.phasors, *phasors_of(used, single))
+    lines = (*measured.lines, *lines_of(used, single))
     data = matrix_of(measured.response)
     notes = list(measured.notes)
     order: OrderSelection | None = None
@@ -126,9 +128,10 @@ def identify_joint(
                 last = {axis.name: len(axis.masses) for axis in prior.axes} if prior else {}
                 modal, start = _known_order(data, {**last, **masses}, kinds, prior, notes)
         priors = {f"{name}.mass[1]": mass for name, mass in (motor_masses or {}).items()}
-        fit = _Fit(phasors, recording, priors)
+        fit = _Fit([one.phasors(recording.names) for one in lines], recording, priors)
         first = _first_fit(_starts(start, modal, prior, kinds), data, priors)
         fitted, friction = fit.run(first)
+        fitted = _with_free_motion(fitted, WholeRecords.of(recording, lines, friction), priors)
     _check_explained(fit.unexplained(fitted), friction)
     notes += [unknown.reason for unknown in fitted.unknown]
     notes += _friction_notes(friction, recording)
@@ -184,10 +187,15 @@ def _responses(solved: FrequencyResponse) -> dict[str, FrequencyResponse]:
 
 def phasors_of(recording: Recording, experiments: Sequence[Experiment]) -> tuple[Phasors, ...]:
     """Return the steady phasors of each experiment at its excited lines, however few there are."""
+    return tuple(one.phasors(recording.names) for one in lines_of(recording, experiments))
+
+
+def lines_of(recording: Recording, experiments: Sequence[Experiment]) -> tuple[LinePhasors, ...]:
+    """Return the steady phasors of each experiment at all lines, however few there are."""
     if not experiments:
         return ()
     inputs = [with_lines(recording, joint_input(recording, one)) for one in experiments]
-    return tuple(one.phasors(recording.names) for one in line_phasors(recording, inputs))
+    return tuple(line_phasors(recording, inputs))
 
 
 def _sets(
@@ -397,6 +405,29 @@ class _Fit:
         )
 
 
+def _with_free_motion(
+    start: RefinedModel, records: WholeRecords, priors: Mapping[str, Estimate]
+) -> RefinedModel:
+    """Fit whole records, transients and all; the start's frictions that were not seen stay out."""
+    if records.too_long:
+        return start
+    axes = start.model.axes
+    still = [f"{axis.name}.viscous_friction" for axis in axes if not axis.viscous_friction.value]
+    found = start
+    for _ in range(WEIGHTINGS):
+        found = refine(
+            found.model,
+            records.data(found, run_in=not np.any(records.friction)),
+            fixed=still,
+            priors=priors,
+            fit_delay=True,
+            fit_friction=True,
+            fit_load_friction=any(axis.load_friction.value for axis in axes),
+            delays=found.delay_values.tolist(),
+        )
+    return found
+
+
 def _still_loads(model: MachineModel) -> MachineModel:
     """Return the model without friction at its last masses: that is fitted only where it shows."""
     axes = tuple(replace(axis, load_friction=Estimate(0.0)) for axis in model.axes)
@@ -467,7 +498,7 @@ def _with_effects(
     """Put delays and dry friction that are seen among the model's effects."""
     effects = list(fitted.model.effects)
     for axis, delay in zip(fitted.model.axes, fitted.delays, strict=True):
-        if abs(delay.value) > max(SEEN * delay.std, DELAY_SHARE * recording.sample_period):
+        if abs(delay.value) > max(DELAY_SEEN * delay.std, DELAY_SHARE * recording.sample_period):
             effects.append(_effect("measurement_delay", axis.name, "delay", delay, "s"))
     for k in friction.seen(SEEN):
         unit = recording.axes[k].torque_unit

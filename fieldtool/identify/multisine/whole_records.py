@@ -1,0 +1,200 @@
+"""Whole records of multisines made ready for the fit that holds the machine's own free motion.
+
+What the equation error's noise is, the bins between the lines of the periods tell: what repeats is
+not there, and transients are explained by the machine.  Of the noise of positions and torques only the
+shape is taken as it came with the phasors (:mod:`fieldtool.frf.multisine.lines`); errors whitened with
+it are averaged over neighbouring bins.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fieldtool.frf.held_targets import folded_course
+from fieldtool.frf.multisine.lines import LinePhasors, same_level
+from fieldtool.frf.multisine.transient import windows
+from fieldtool.frf.phasors import equation_errors
+from fieldtool.identify.likelihood.record_data import (
+    RecordData,
+    RecordSystem,
+    Spectrum,
+    spectrum_of,
+)
+from fieldtool.identify.likelihood.refine import RefinedModel, machine_response
+from fieldtool.identify.likelihood.whitening import whitening
+from fieldtool.identify.multisine.dry_friction import SEEN, DryFriction, signs_of_velocity
+from fieldtool.records.recording import Recording
+
+FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+FREEDOM_AN_AXIS = 40.0
+"""Degrees of freedom of the noise's estimate, for each axis."""
+FEWEST_AN_AXIS = 4.0
+"""Below so many the noise keeps its shape and gets one factor."""
+SLOWEST = 0.5
+"""Of the lowest excited line: slower motion says nothing of the machine, and much of what drifts."""
+SAME_NOISE = 2.0
+"""Experiments whose noise powers differ by less share one estimate."""
+MOST_NUMBERS = 100_000
+"""Measured numbers above which records are too long: many periods leave little of transients."""
+
+
+@dataclass(frozen=True, eq=False)
+class WholeRecords:
+    """Multisine experiments whose spectra can be taken over any stretch."""
+
+    recording: Recording
+    lines: tuple[LinePhasors, ...]
+    """Of each experiment used."""
+    friction: FloatArray
+    """(M,), N m or N: dry friction that is taken off the torques."""
+
+    @classmethod
+    def of(
+        cls, recording: Recording, lines: Sequence[LinePhasors], friction: DryFriction
+    ) -> "WholeRecords":
+        """Take off the dry friction that is seen."""
+        taken = np.zeros(len(recording.axes))
+        for k in friction.seen(SEEN):
+            taken[k] = friction.torque[k].value
+        return cls(recording, tuple(lines), taken)
+
+    @property
+    def too_long(self) -> bool:
+        """Whether there are too many bins for a fit."""
+        axes = len(self.recording.axes)
+        bins = sum(float(one.frequencies[-1]) * one.given.experiment.samples for one in self.lines)
+        return 2 * axes * bins * self.recording.sample_period > MOST_NUMBERS
+
+    def data(self, found: RefinedModel, *, run_in: bool) -> RecordData:
+        """Return spectra of periods, with the run-in before them or without, and their noise.
+
+        Parameters
+        ----------
+        found
+            The best machine so far: it tells what noise is.
+        run_in
+            Whether what comes before the whole periods is in.
+        """
+        between = [self._spectrum(one, run_in=False, beyond=True) for one in self.lines]
+        wide = [self._spectrum(one, run_in=run_in, beyond=False) for one in self.lines]
+        rough = tuple(self._rough(*each, found) for each in zip(self.lines, between, strict=True))
+        told = RecordData(self.recording.names, tuple(between), rough)
+        seen = told.systems(found.model, found.delay_values)
+        covariance: dict[int, ComplexArray] = {}
+        for group in self._groups(seen):
+            noise = _Noise.of([(self.lines[k], seen[k]) for k in group])
+            for k in group:
+                white = whitening(self._rough(self.lines[k], wide[k], found))
+                covariance[k] = noise.coloured(white, wide[k].omega)
+        names = self.recording.names
+        return RecordData(names, tuple(wide), tuple(covariance[k] for k in range(len(wide))))
+
+    def _spectrum(self, one: LinePhasors, *, run_in: bool, beyond: bool) -> Spectrum:
+        """Spectrum up to the highest line, or as far beyond it as the noise is wanted."""
+        experiment, step, rows = one.given.experiment, self.recording.sample_period, one.given.rows
+        torque = experiment.torque - folded_course(self.recording, experiment)
+        if np.any(self.friction):
+            signs = signs_of_velocity(experiment, step, float(one.frequencies[-1]))
+            torque = torque - signs * self.friction
+        last = one.given.lines[-1]
+        first = 0 if run_in else rows.start - 1
+        signals = np.hstack([experiment.position, torque])[max(first, 0) : rows.stop]
+        if first < 0 or (run_in and rows.start == 0):
+            signals = _with_next(signals, one.given.samples)
+        duration = (signals.shape[0] - 1) * step
+        period = one.given.samples * step
+        highest = last + max(10, last // 3) if beyond else last
+        top = min(int(highest * duration / period + 1e-6), signals.shape[0] // 2 - 1)
+        low = 1 if beyond else max(1, int(SLOWEST * one.given.lines[0] * duration / period))
+        bins, M = np.arange(low, top + 1), len(self.recording.axes)
+        return spectrum_of(signals[:, :M], signals[:, M:], step, bins)
+
+    def _rough(self, one: LinePhasors, at: Spectrum, found: RefinedModel) -> ComplexArray:
+        """Covariance of the equation error as the phasors' noise says."""
+        place = at.omega / (2 * np.pi)
+        above = np.clip(np.searchsorted(one.frequencies, place), 1, one.frequencies.size - 1)
+        below, step = above - 1, one.frequencies[1] - one.frequencies[0]
+        share = np.clip((place - one.frequencies[below]) / step, 0.0, 1.0)[:, None, None]
+        noise = (1 - share) * one.covariance[below] + share * one.covariance[above]
+        periods = one.given.periods * one.given.samples * self.recording.sample_period
+        response = machine_response(found.model, at.omega, found.delay_values)
+        errors: ComplexArray = equation_errors(response, noise) * (periods / at.duration)
+        return errors
+
+    def _groups(self, seen: Sequence[RecordSystem]) -> list[list[int]]:
+        """Experiments whose noise is alike."""
+        power = [np.mean(np.abs(one.white) ** 2, axis=0) for one in seen]
+        groups: list[list[int]] = []
+        for k, one in enumerate(self.lines):
+            for group in groups:
+                first = self.lines[group[0]]
+                ratio = power[k] / power[group[0]]
+                alike = (ratio < SAME_NOISE) & (ratio > 1 / SAME_NOISE)
+                design = (one.given.samples, one.given.periods)
+                if (
+                    design == (first.given.samples, first.given.periods)
+                    and same_level(one.level, first.level)
+                    and np.all(alike)
+                ):
+                    group.append(k)
+                    break
+            else:
+                groups.append([k])
+        return groups
+
+
+@dataclass(frozen=True, eq=False)
+class _Noise:
+    """What errors between the lines have more, or less, than rough noise: after whitening with it."""
+
+    omega: FloatArray
+    """(B,), rad/s, of the bins between the lines."""
+    products: ComplexArray
+    """(B + 1, M, M): sums of e e^H over all bins before."""
+    counts: FloatArray
+    """(B + 1,): sums of their degrees of freedom."""
+
+    @classmethod
+    def of(cls, seen: "Sequence[tuple[LinePhasors, RecordSystem]]") -> "_Noise":
+        """From experiments of one design."""
+        periods = seen[0][0].given.periods
+        omega = seen[0][1].one.omega
+        between = (np.arange(omega.size) + 1) % periods != 0
+        white = np.array([system.white[between] for _, system in seen])
+        products = np.einsum("ebi,ebj->bij", white, white.conj()) / 2.0
+        freedom = np.sum([system.freedom[between] for _, system in seen], axis=0)
+        zero = np.zeros((1, *products.shape[1:]))
+        return cls(
+            omega[between],
+            np.concatenate([zero, np.cumsum(products, axis=0)]),
+            np.concatenate([[0.0], np.cumsum(freedom)]),
+        )
+
+    def coloured(self, white: ComplexArray, omega: FloatArray) -> ComplexArray:
+        """Return covariances (F, M, M) at frequencies where `white` whitens the rough ones.
+
+        The inverse of a covariance estimated with D degrees of freedom is D / (D - M) too large on
+        average, which is put right.
+        """
+        M = white.shape[1]
+        low, high = windows(self.omega, self.counts, omega, FREEDOM_AN_AXIS * M)
+        freedom = self.counts[high] - self.counts[low]
+        total = self.products[high] - self.products[low]
+        if freedom.min() < FEWEST_AN_AXIS * M:
+            factor = np.trace(total, axis1=1, axis2=2).real / M
+            total = factor[:, None, None] * np.eye(M)
+            mean = total / np.maximum(freedom, 1e-9)[:, None, None]
+        else:
+            mean = total / (freedom - M)[:, None, None]
+        back = np.linalg.inv(white) * np.sqrt(2.0)
+        covariance: ComplexArray = back @ mean @ back.conj().transpose(0, 2, 1)
+        return (covariance + covariance.conj().transpose(0, 2, 1)) / 2
+
+
+def _with_next(signals: FloatArray, period: int) -> FloatArray:
+    """Add the row that would follow: one period before, and as far from it as the last two are."""
+    following = signals[-period] + signals[-1] - signals[-1 - period]
+    return np.concatenate([signals, following[None]])

@@ -1,0 +1,216 @@
+"""Spectra of whole records: free motion explains transients, and what is left is noise."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from fieldtool.frf.held_targets import LINEAR_TARGETS, folded_course, folded_phasors
+from fieldtool.frf.multisine.matrix import joint_response
+from fieldtool.identify.likelihood.least_squares import standard_errors
+from fieldtool.identify.likelihood.parameters import (
+    machine_parameters,
+    parameter_values,
+    with_values,
+)
+from fieldtool.identify.likelihood.record_data import RecordData, Spectrum, spectrum_of
+from fieldtool.identify.likelihood.refine import RefinedModel, machine_response, refine
+from fieldtool.identify.multisine.dry_friction import signs_of_velocity
+from fieldtool.identify.multisine.whole_records import WholeRecords
+from fieldtool.records.closed_loop import AxisLoop, ClosedLoop
+from fieldtool.records.model import MachineModel
+from fieldtool.records.recorded import AxisInfo, Controller, Experiment, Recording
+
+STEP, FINE = 0.002, 16
+TORQUE, POSITION = 0.02, 3e-7
+PERIOD = 1.5
+
+
+@dataclass
+class Shaken:
+    """A machine under its loops, shaken from rest, without noise."""
+
+    model: MachineModel
+    recording: Recording
+
+
+def shaken(rng, model, *, count=2, periods=2, settle=0.2, drift=0.0, late=0):
+    """Multisines of all axes from rest; torques are recorded `late` fine steps after they acted."""
+    rows = round((settle + periods * PERIOD) / STEP) * FINE
+    time = (np.arange(rows) - round(settle / STEP) * FINE) * STEP / FINE
+    lines = np.arange(1, 40, 2)
+    waves = np.exp(2j * np.pi * np.outer(time, lines / PERIOD))
+    loops = tuple(
+        AxisLoop(rng.uniform(5, 9), axis.total_mass * rng.uniform(10, 20), rng.uniform(5, 50), 0.0)
+        for axis in model.axes
+    )
+    experiments = []
+    for number in range(count):
+        phases = np.exp(2j * np.pi * rng.random((lines.size, len(loops))))
+        size = 0.01 / np.maximum(lines / PERIOD, 2)[:, None]
+        reference = np.real(waves @ (phases * size)) + drift * (time - time[0])[:, None]
+        position, torque = ClosedLoop(model, loops).simulate(reference, STEP / FINE)
+        torque = np.roll(torque, late, axis=0)
+        torque[:late] = torque[late]
+        experiments.append(
+            Experiment(
+                f"m{number + 1}", "multisine", model.names, (), PERIOD,
+                np.arange(rows // FINE) * STEP, position[::FINE].copy(), torque[::FINE].copy(),
+                position_reference=reference[::FINE].copy(),
+            )
+        )  # fmt: skip
+    axes = tuple(AxisInfo(axis.name, "rotary") for axis in model.axes)
+    return Shaken(model, Recording(STEP, axes, tuple(experiments)))
+
+
+def with_noise(recording, rng):
+    experiments = tuple(
+        replace(
+            one,
+            position=one.position + POSITION * rng.normal(size=one.position.shape),
+            torque=one.torque + TORQUE * rng.normal(size=one.torque.shape),
+        )
+        for one in recording.experiments
+    )
+    return replace(recording, experiments=experiments)
+
+
+def known_noise(model: MachineModel, one: Spectrum, rows: int) -> np.ndarray:
+    """Covariance of the equation error of white noise: 4 s^2 / N an amplitude."""
+    G = machine_response(model, one.omega)
+    torque, position = 4 * TORQUE**2 / rows, 4 * POSITION**2 / rows
+    return torque * G @ G.conj().transpose(0, 2, 1) + position * np.eye(G.shape[1])
+
+
+def data_of(recording: Recording, model: MachineModel, top: float = 26.0) -> RecordData:
+    spectra = []
+    for one in recording.experiments:
+        bins = np.arange(1, int(top * (one.samples - 1) * STEP))
+        spectra.append(spectrum_of(one.position, one.torque, STEP, bins))
+    rows = recording.experiments[0].samples
+    noise = tuple(known_noise(model, one, rows) for one in spectra)
+    return RecordData(model.names, tuple(spectra), noise)
+
+
+@pytest.mark.parametrize("drift", [0.0, 0.5])
+def test_transients_leave_nothing_at_the_true_machine(random_model, fresh_rng, drift):
+    model = random_model(fresh_rng, (3, 2), friction=True)
+    data = data_of(shaken(fresh_rng, model, drift=drift).recording, model)
+    left = data.residuals(model, np.zeros(2))
+    moved = [np.linalg.norm(one.position, axis=1) for one in data.spectra]
+    noise = [np.sqrt(np.einsum("fii->f", c).real) for c in data.covariance]
+    clear = np.median(np.concatenate(moved) / np.concatenate(noise))
+    assert np.sqrt(np.mean(left**2)) < 2e-4 * clear
+    heavier = replace(
+        model.axes[0], masses=tuple(replace(m, value=m.value * 1.01) for m in model.axes[0].masses)
+    )
+    wrong = replace(model, axes=(heavier, *model.axes[1:]))
+    assert np.linalg.norm(data.residuals(wrong, np.zeros(2))) > 20 * np.linalg.norm(left)
+
+
+def test_a_delayed_torque_is_explained_by_its_delay(random_model, fresh_rng):
+    model = random_model(fresh_rng, (2, 2))
+    data = data_of(shaken(fresh_rng, model, late=10).recording, model)
+    delay = np.full(2, -10 * STEP / FINE)  # recorded after it acted
+    explained, not_explained = (
+        np.linalg.norm(data.residuals(model, d)) for d in (delay, np.zeros(2))
+    )
+    assert explained < 0.02 * not_explained
+
+
+def test_derivatives_are_those_of_the_residuals(random_model, fresh_rng):
+    """At the true machine, where what the states do besides is second order."""
+    model = random_model(fresh_rng, (3, 1, 2), friction=True)
+    data = data_of(shaken(fresh_rng, model).recording, model)
+    parameters, delays = machine_parameters(model, data.omega), [1e-5, 0.0, -2e-5]
+    values = parameter_values(model, parameters, delays)
+    analytic = data.jacobian(model, np.array(delays), parameters)
+    for k, p in enumerate(parameters):
+        change = 1e-5 * (abs(values[k]) or p.scale)
+        ends = []
+        for sign in (1.0, -1.0):
+            moved = values.copy()
+            moved[k] += sign * change
+            ends.append(data.residuals(*with_values(model, parameters, moved)))
+        numeric = (ends[0] - ends[1]) / (2 * change)
+        error = np.linalg.norm(numeric - analytic[:, k])
+        assert error < 0.02 * np.linalg.norm(analytic[:, k]), p.name
+
+
+def as_found(model: MachineModel) -> RefinedModel:
+    """The machine as if a fit had found it."""
+    axes = len(model.axes)
+    none = np.zeros(0)
+    zero = tuple(a.viscous_friction for a in model.axes)
+    return RefinedModel(
+        model, (replace(zero[0], value=0.0),) * axes, (), none, np.zeros((0, 0)), 0.0, 1, ()
+    )
+
+
+def test_intervals_are_honest_and_noise_is_found_between_the_lines(random_model, fresh_rng):
+    model = random_model(fresh_rng, (2, 2))
+    truth = shaken(fresh_rng, model, periods=3)
+    pulls, ratios = [], []
+    for _ in range(24):
+        recording = with_noise(truth.recording, fresh_rng)
+        records = WholeRecords(recording, joint_response(recording).lines, np.zeros(2))
+        data = records.data(as_found(model), run_in=True)
+        rows = recording.experiments[0].samples - 1
+        for one, covariance in zip(data.spectra, data.covariance, strict=True):
+            power = np.einsum("fii->fi", covariance).real
+            ratios.append(power / np.einsum("fii->fi", known_noise(model, one, rows)).real)
+        found = refine(model, data, fit_delay=True)
+        values = parameter_values(model, machine_parameters(model, data.omega), [0.0, 0.0])
+        named = dict(
+            zip((p.name for p in machine_parameters(model, data.omega)), values, strict=True)
+        )
+        error = found.values - np.array([named[name] for name in found.names])
+        pulls.append(error / standard_errors(found.covariance))
+    assert np.mean(ratios) == pytest.approx(1.0, abs=0.12)
+    assert 0.75 < np.sqrt(np.mean(np.square(pulls))) < 1.3
+
+
+def test_periods_without_a_run_in_serve_as_well(random_model, fresh_rng):
+    """Nothing before the first period: the row after the last one follows from the period before."""
+    model = random_model(fresh_rng, (2, 1))
+    truth = shaken(fresh_rng, model, settle=0.0).recording
+    records = WholeRecords(truth, joint_response(with_noise(truth, fresh_rng)).lines, np.zeros(2))
+    for run_in in (True, False):
+        data = records.data(as_found(model), run_in=run_in)
+        assert data.spectra[0].duration == pytest.approx(2 * PERIOD)
+        found = refine(model, data)
+        for one, other in zip(found.model.axes, model.axes, strict=True):
+            for a, b in zip(one.masses, other.masses, strict=True):
+                assert abs(a.value - b.value) < 5 * a.std + 1e-3 * b.value
+
+
+def test_signs_of_velocity(fresh_rng):
+    time = np.arange(3000) * STEP
+    rates, phases = np.array([0.7, 1.9, 3.3]), fresh_rng.uniform(0, 6.0, 3)
+    angle = 2 * np.pi * np.outer(time, rates) + phases
+    position = (np.sin(angle) / rates).sum(axis=1) + 0.3 * time
+    velocity = 2 * np.pi * np.cos(angle).sum(axis=1) + 0.3
+    noisy = position + 1e-5 * fresh_rng.normal(size=time.size)
+    one = Experiment("m", "other", ("x",), (), None, time, noisy[:, None], 0 * noisy[:, None])
+    signs = signs_of_velocity(one, STEP, 3.3)[:, 0]
+    clear = np.abs(velocity) > 0.02 * np.abs(velocity).max()
+    clear[:20] = clear[-20:] = False
+    assert np.array_equal(signs[clear], np.sign(velocity[clear]))
+
+
+def test_folded_images_row_by_row_are_those_of_phasors(fresh_rng):
+    rate, phase = 6.0, fresh_rng.uniform(0, 6.0)
+    time = np.arange(1000) * STEP
+    reference = 0.01 * np.cos(2 * np.pi * rate * time + phase)[:, None]
+    zero = np.zeros_like(reference)
+    one = Experiment(
+        "m", "multisine", ("x",), (), 0.5, time, zero, zero, position_reference=reference
+    )
+    axes = (AxisInfo("x", "rotary", controller=Controller(10.0, 8.0, 5.0, 100.0)),)
+    recording = Recording(STEP, axes, (one,), source={LINEAR_TARGETS: "x=0.0003"})
+    course = folded_course(recording, one)[500:, 0]
+    wave = np.exp(-2j * np.pi * rate * time[500:])
+    expected = folded_phasors(
+        recording, np.array([rate]), np.array([[0.01 * np.exp(1j * phase)]], complex)
+    )[0, 0]
+    assert 2 * np.mean(course * wave) == pytest.approx(expected, rel=2e-3)
