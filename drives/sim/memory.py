@@ -1,5 +1,7 @@
 """Non-volatile memory of the simulated drive: what survives a power cycle."""
 
+from typing import Literal
+
 from drives.sim.dictionary import DriveDictionary, Key, Value
 from drives.sim.entries import ENTRIES
 
@@ -12,6 +14,11 @@ VOLATILE_KEYS = tuple(key for key, entry in ENTRIES.items() if entry.access == "
 COMMUNICATION_KEYS = tuple(key for key in VOLATILE_KEYS if key[0] in _COMMUNICATION)
 """The part of it that a reset of the communication sets back."""
 
+Bank = Literal["old", "new", "corrupted"]
+"""What memory holds when the supply failed while it was written: drives with two banks hold what was
+there before or, if only the end was missing, what was to be stored; others hold neither, find a wrong
+checksum when they are switched on, and begin with factory values."""
+
 
 class NonVolatileMemory:
     """Stored parameters by key; empty on a new drive."""
@@ -20,6 +27,8 @@ class NonVolatileMemory:
         self._stored: dict[Key, Value] = {}
         self.node_id: int | None = None
         """What LSS stored."""
+        self.corrupted = False
+        """Whether its checksum is wrong: factory values are valid."""
 
     @property
     def stored(self) -> dict[Key, Value]:
@@ -28,11 +37,18 @@ class NonVolatileMemory:
 
     def save(self, dictionary: DriveDictionary) -> None:
         """Store every parameter as it stands in the drive's working memory."""
-        self._stored = dictionary.parameters()
+        self._stored, self.corrupted = dictionary.parameters(), False
 
     def erase(self) -> None:
         """Forget what was stored: from the next reset on, factory values are valid."""
-        self._stored = {}
+        self._stored, self.corrupted = {}, False
+
+    def cut_off(self, bank: Bank, dictionary: DriveDictionary) -> None:
+        """Hold what is left when the supply fails while it is written."""
+        if bank == "new":
+            self.save(dictionary)
+        elif bank == "corrupted":
+            self._stored, self.corrupted = {}, True
 
     def recall(self, dictionary: DriveDictionary, *, all_of_it: bool) -> None:
         """Fill working memory as after power-up; without ``all_of_it`` the communication part."""

@@ -24,7 +24,7 @@ from drives.sim.emergency import (
 )
 from drives.sim.firmware import SimulatedAxes
 from drives.sim.heartbeat import HeartbeatConsumers, HeartbeatProducer
-from drives.sim.memory import LOAD, SAVE, NonVolatileMemory
+from drives.sim.memory import LOAD, SAVE, Bank, NonVolatileMemory
 from drives.sim.motion import MotionControl
 from drives.sim.nmt import NetworkManagement
 from drives.sim.pdo import Getter, PdoService, Setter
@@ -33,7 +33,7 @@ from drives.sim.scales import FILTER_KEYS, GAINS, LIMIT_KEYS, Scales
 from drives.sim.scheduler import VirtualScheduler
 from drives.sim.sdo import DriveSdoServer
 
-CONNECTION_ERROR = 0x8100
+CONNECTION_ERROR, PARAMETERS_LOST = 0x8100, 0x6310
 _PRODUCES_SYNC = 1 << 30
 _FAULT, _DISABLE_VOLTAGE, _QUICK_STOP = 1, 2, 3
 _TO_PRE_OPERATIONAL, _TO_STOPPED = 0, 2
@@ -85,6 +85,7 @@ class DriveNode:
         """Fault injection: abort code with which storing ends."""
         self.on_store: Callable[[], None] | None = None
         """Fault injection: called when storing begins."""
+        self._saving = False
         self.nmt = NetworkManagement(node_id, self._reset)
         self.dictionary = dictionary = DriveDictionary(node_id, overrides)
         self.memory = NonVolatileMemory()
@@ -157,8 +158,13 @@ class DriveNode:
         if self.pdo.event_driven:
             self.pdo.at_task(now)
 
-    def power_cycle(self) -> None:
-        """Switch the drive's supply off and on: what was not stored is forgotten."""
+    def power_cycle(self, bank: Bank = "old") -> None:
+        """Switch the drive's supply off and on: what was not stored is forgotten.
+
+        ``bank`` is what its memory then holds, if it was storing at that moment.
+        """
+        if self._saving and self.sdo.busy:
+            self.memory.cut_off(bank, self.dictionary)
         self.nmt.pending_node_id = self.memory.node_id or self._first_node_id
         self._reset(whole=True)
 
@@ -184,6 +190,8 @@ class DriveNode:
             self.emergency.power_up()
             self.motion.power_up()
         self._boot()
+        if whole and self.memory.corrupted:
+            self.emergency.report(PARAMETERS_LOST, ErrorRegister.DEVICE_PROFILE)
 
     def _boot(self) -> None:
         self._apply_parameters()
@@ -376,6 +384,7 @@ class DriveNode:
     def _begin_store(self, finish: Callable[[], int | None]) -> None:
         if self.on_store is not None:
             self.on_store()
+        self._saving = finish == self._save
         self.sdo.wait_with_answer(self.store_time, finish)
 
     def _save(self) -> int | None:

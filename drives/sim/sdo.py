@@ -114,6 +114,11 @@ class DriveSdoServer(SDOServer):  # type: ignore[misc]  # durand is not typed
         elif not self._faulty(bytes(msg)):
             super().handle_msg(cob_id, bytes(msg))
 
+    @property
+    def busy(self) -> bool:
+        """Whether an answer is held back."""
+        return self._busy is not None
+
     def wait_with_answer(self, seconds: float, finish: Callable[[], int | None]) -> None:
         """Hold the answer to the present request back for a time, and requests after it.
 

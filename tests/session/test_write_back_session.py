@@ -17,6 +17,7 @@ from drives.sim.faults import (
     StoreFails,
     WriteAltered,
 )
+from drives.sim.memory_faults import PowerLossWhileStoring
 
 TABLE, ARM = 11, 12
 VELOCITY_P, VELOCITY_I, POSITION_P = (0x2010, 2), (0x2010, 3), (0x2010, 1)
@@ -401,3 +402,23 @@ def test_no_backup_to_restore(session):
     outcome = session.command("restore", session.out)
     assert outcome.code == 2
     assert "parameters-before.yaml" in outcome.err
+
+
+# --- power lost while storing --------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("bank", ["old", "new", "corrupted"])
+@pytest.mark.parametrize("node", [TABLE, ARM])
+def test_a_supply_that_fails_while_storing_leaves_old_values_everywhere(session, node, bank):
+    """Working memory and, after another power cycle, what was stored: the old values."""
+    for each in session.machine.nodes:
+        each.dictionary.write(*VELOCITY_P, 1300)  # not the factory's: those would show
+        each.memory.save(each.dictionary)
+    session.before = session.objects()
+    session.inject(PowerLossWhileStoring(node, bank))
+    outcome = write(session, "--store")
+    assert outcome.code == 6, outcome.err
+    assert "did not answer" in outcome.err
+    assert session.changed() == {}
+    power_cycle(session)
+    assert session.changed() == {}
