@@ -43,7 +43,7 @@ class Transaction:
     backup
         Everything that the drives held before it.
     save
-        Is given the journal before and after each step; what it raises ends the write.
+        Is given the journal before and after each step; an OSError ends the write.
     """
 
     def __init__(
@@ -53,8 +53,9 @@ class Transaction:
         self._backups = {part.axis: part for part in backup.drives}
         self._save = save
         self.journal = journal
+        self._begun = False
         self.outcomes = {r.axis: DriveOutcome(r.axis, r.node_id) for r in journal.drives}
-        self.unsaved: Exception | None = None
+        self.unsaved: OSError | None = None
         """Why the journal could not be saved on the way back."""
 
     # --- forward ---------------------------------------------------------------------------------
@@ -64,6 +65,8 @@ class Transaction:
 
         Raises
         ------
+        OSError
+            If the journal could not be saved before the first write; nothing was written.
         WriteBackError
             If a drive refused or holds another value: all drives hold their old values.
         WriteBackMixedError
@@ -71,6 +74,7 @@ class Transaction:
         """
         try:
             self._save(self.journal)
+            self._begun = True
             while (step := next_step(self.journal)) is not None:
                 self._step_forward(step)
         except BaseException as error:
@@ -132,8 +136,8 @@ class Transaction:
 
     def _go(self, journal: Journal) -> None:
         if journal != self.journal:
-            self.journal = journal
             self._save(journal)
+            self.journal = journal
 
     def _record(self, axis: str) -> DriveRecord:
         return self.journal.drive(axis)
@@ -146,9 +150,10 @@ class Transaction:
             self._back_again(self.journal.turned_back(distrust=False), whole=False)
         reason = str(cause).rstrip(".") or type(cause).__name__
         self._refuse_mixed(f"writing failed: {reason}. Not everything could be restored", cause)
-        if isinstance(cause, DrivesError) and not isinstance(cause, StoppedError):
+        failed = self._begun if isinstance(cause, OSError) else not isinstance(cause, StoppedError)
+        if failed and isinstance(cause, DrivesError | OSError):
             raise WriteBackError(
-                f"{cause} Nothing was changed: all parameters were restored and read back."
+                f"{reason}. Nothing was changed: all parameters were restored and read back."
                 f"{self._stored_back()}"
             ) from cause
 
@@ -230,8 +235,8 @@ class Transaction:
         """Save the journal if that is possible: on the way back nothing may stand in it."""
         try:
             self._go(journal)
-        except Exception as error:
-            self.unsaved = error
+        except OSError as error:
+            self.unsaved, self.journal = error, journal
 
     def _refuse_mixed(self, what: str, cause: BaseException | None) -> None:
         """Raise, if not everything is as it was."""

@@ -28,7 +28,7 @@ from drives.parameters import (
     load_journal,
 )
 from drives.parameters.journal import Goal
-from fieldtool.writeback.unfinished import JOURNAL, JournalKeeper
+from fieldtool.writeback.unfinished import JOURNAL, JournalKeeper, not_kept
 
 FIRST_BACKUP = "parameters-before.yaml"
 
@@ -166,7 +166,7 @@ def bring_back(
         If a value could not be restored or stored; every other one was.
     """
     before = source.journal
-    journal = _journal_back(machine, source, store)
+    journal = journal_back(machine, source, store)
     check_same_drives(drives, source.backup.drives, "backup", trusted=same_drives)
     by_axis = {drive.axis: drive for drive in drives}
     notes = []
@@ -186,7 +186,10 @@ def bring_back(
     taking_part = [by_axis[part.axis] for part in source.backup.drives]
     keeper = JournalKeeper(source.backup_path.with_name(JOURNAL))
     transaction = Transaction(taking_part, journal, source.backup, keeper)
-    transaction.restore()
+    try:
+        transaction.restore()
+    except OSError as error:
+        raise not_kept(keeper, error) from error
     if transaction.unsaved is not None:
         notes.append(
             f"{transaction.unsaved} The drives are in order, but the journal does not say so: run "
@@ -201,7 +204,7 @@ def bring_back(
     )
 
 
-def _journal_back(machine: str, source: Source, store: bool) -> Journal:
+def journal_back(machine: str, source: Source, store: bool) -> Journal:
     """Return the journal of bringing a backup back; it goes on where one before was cut off."""
     before = source.journal
     missing = {r.axis for r in before.drives} if before is not None and before.is_open else set()

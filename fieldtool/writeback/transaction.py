@@ -22,7 +22,7 @@ from drives.parameters import (
 )
 from fieldtool.design.tuning import Tuning
 from fieldtool.writeback.backups import take_backup
-from fieldtool.writeback.unfinished import JOURNAL, JournalKeeper, refuse_unfinished
+from fieldtool.writeback.unfinished import JOURNAL, JournalKeeper, not_kept, refuse_unfinished
 
 Confirm = Callable[[Sequence[Change]], bool]
 
@@ -129,7 +129,10 @@ def apply(
     journal = planned_journal(machine, drives, changes, backup_path.name, storing)
     keeper = JournalKeeper(backup_path.with_name(JOURNAL))
     transaction = Transaction(drives, journal, load_backup(backup_path), keeper)
-    transaction.write()
+    try:
+        transaction.write()
+    except OSError as error:
+        raise not_kept(keeper, error) from error
     written = tuple(Written(change, change.after) for change in changes)
     return WriteBack(written, changes, in_memory=True, stored=keep, backup=backup_path)
 

@@ -51,23 +51,16 @@ class JournalKeeper:
 
         Raises
         ------
-        OutputError
+        OSError
             If journal or notes can not be written.
         """
-        try:
-            save_journal(journal, self.path)
-            if journal.is_open and not self._noted:
-                self._note(journal)
-                self._noted = True
-            elif not journal.is_open:
-                for record in journal.drives:
-                    remove_durably(_note_of(journal.machine, record))
-        except OSError as error:
-            raise OutputError(
-                f"{error.filename or self.path}: the journal of the write can not be kept "
-                f"({error.strerror}). Without it nothing is written to the drives. Make room, choose "
-                f"another folder, or name one for the notes in {STATE_VARIABLE}."
-            ) from error
+        save_journal(journal, self.path)
+        if journal.is_open and not self._noted:
+            self._note(journal)
+            self._noted = True
+        elif not journal.is_open:
+            for record in journal.drives:
+                remove_durably(_note_of(journal.machine, record))
 
     def _note(self, journal: Journal) -> None:
         state_folder().mkdir(parents=True, exist_ok=True)
@@ -80,6 +73,15 @@ class JournalKeeper:
                 "begun": journal.begun,
             }
             write_durably(_note_of(journal.machine, record), yaml.safe_dump(data).encode())
+
+
+def not_kept(keeper: JournalKeeper, error: OSError) -> OutputError:
+    """Return the refusal to write without a journal."""
+    return OutputError(
+        f"{error.filename or keeper.path}: the journal of the write can not be kept "
+        f"({error.strerror or error}). Without it nothing is written to the drives. Make room, choose "
+        f"another folder, or name one for the notes in {STATE_VARIABLE}."
+    )
 
 
 def state_folder() -> Path:

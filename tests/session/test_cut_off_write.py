@@ -1,0 +1,389 @@
+"""A write that is cut off is noticed by the next session, and taken back by ``fieldtool restore``."""
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+import yaml
+
+from drives.canopen_drive import CanopenDrive
+from drives.parameters import Memory, Phase, load_journal, save_journal
+from drives.parameters.backup import checksum
+from drives.sim.faults import DriveFault, NodeVanishes
+from fieldtool.writeback import unfinished
+
+TABLE, ARM = 11, 12
+VELOCITY_P, VELOCITY_I, POSITION_P = (0x2010, 2), (0x2010, 3), (0x2010, 1)
+NEW = {"velocity_p": 2.0, "velocity_i": 16.0, "position_p": 20.0}
+PER_DRIVE = 3
+"""Objects written to each drive."""
+
+
+class HostDiedError(BaseException):
+    """Nothing of the tool runs any more; only this process goes on."""
+
+
+@pytest.fixture
+def session(bench):
+    """A session folder with a tuning for both axes; drives whose stored values are not factory's."""
+    make_session(bench, bench.out)
+    for node in bench.machine.nodes:
+        node.dictionary.write(*VELOCITY_P, 1300)
+        node.memory.save(node.dictionary)
+    bench.before = bench.objects()
+    return bench
+
+
+def make_session(bench, folder, axes=("table", "arm")):
+    folder.mkdir(parents=True)
+    (folder / "machine.yaml").write_text(bench.profile.read_text())
+    tuning = {
+        "format": "fieldtool-tuning/1",
+        "axes": [
+            {"axis": a, "parameters": NEW, "sensitivity_peak": 1.4, "reason": "test"} for a in axes
+        ],
+    }
+    (folder / "tuning.yaml").write_text(yaml.safe_dump(tuning))
+
+
+def die_at(monkeypatch, number):
+    """Let the host die before its write of this number, from 1; storing counts as one."""
+    read_object, write_object, count, dead = CanopenDrive.read, CanopenDrive.write, [0], [False]
+
+    def write(drive, info, value, timeout=None):
+        count[0] += 1
+        dead[0] = dead[0] or count[0] == number
+        if dead[0]:
+            raise HostDiedError
+        write_object(drive, info, value, timeout)
+
+    def read(drive, info, timeout=None):
+        if dead[0]:
+            raise HostDiedError
+        return read_object(drive, info, timeout)
+
+    def save(journal, path):
+        if dead[0]:
+            raise HostDiedError
+        save_journal(journal, path)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(unfinished, "save_journal", save)
+        patch.setattr(CanopenDrive, "write", write)
+        patch.setattr(CanopenDrive, "read", read)
+        yield
+
+
+@pytest.fixture
+def cut_off(session, monkeypatch):
+    """Cut a write off; ``cut_off(number, store=False)``."""
+
+    def cut(number, store=False):
+        for _ in die_at(monkeypatch, number):
+            with pytest.raises(HostDiedError):
+                session.command("write", session.out, "--yes", *(["--store"] if store else []))
+        return load_journal(session.out / "write-journal.yaml")
+
+    return cut
+
+
+def notes():
+    return sorted(Path(os.environ["FIELDTOOL_STATE_DIR"]).glob("*.yaml"))
+
+
+def power_cycle(bench):
+    for node in bench.machine.nodes:
+        node.power_cycle()
+
+
+def in_one_line(text):
+    return " ".join(text.split())
+
+
+# --- journal -------------------------------------------------------------------------------------
+
+
+def test_the_journal_is_on_the_disk_before_the_first_write(session):
+    seen = []
+
+    def look(_value):
+        journal = load_journal(session.out / "write-journal.yaml")
+        seen.append((journal, len(notes())))
+
+    session.machine.node(TABLE).dictionary.guards[VELOCITY_P] = look
+    assert session.command("write", session.out, "--yes").code == 0
+    journal, noted = seen[0]
+    assert journal.is_open
+    assert noted == 2, "one note for each drive"
+    assert [r.phase for r in journal.drives] == [Phase.WRITING, Phase.PLANNED]
+    assert [r.serial_number for r in journal.drives] == [1011, 1012]
+    entry = next(e for e in journal.drives[0].entries if e.info.name == "velocity_p")
+    assert (entry.before, entry.after) == (1300, 2000)
+    assert (session.out / journal.backup).is_file()
+    ended = load_journal(session.out / "write-journal.yaml")
+    assert not ended.is_open
+    assert {r.phase for r in ended.drives} == {Phase.VERIFIED}
+    assert notes() == []
+
+
+def test_the_journal_says_what_non_volatile_memory_may_hold(cut_off):
+    journal = cut_off(2 * PER_DRIVE + 2, store=True)  # before the second drive stores
+    assert [r.phase for r in journal.drives] == [Phase.STORED, Phase.STORING]
+    assert [r.memory for r in journal.drives] == [Memory.NEW, Memory.UNKNOWN]
+
+
+def test_a_journal_that_can_not_be_kept_means_that_nothing_is_written(session, monkeypatch):
+    blocked = session.folder / "file"
+    blocked.write_text("")
+    monkeypatch.setenv("FIELDTOOL_STATE_DIR", str(blocked / "notes"))
+    outcome = session.command("write", session.out, "--yes")
+    assert outcome.code == 3
+    assert "the journal of the write can not be kept" in outcome.err
+    assert session.changed() == {}
+
+
+def test_a_disk_that_fills_up_in_the_middle_takes_everything_back(session):
+    part = session.out / "write-journal.yaml.part"
+    session.machine.node(ARM).dictionary.guards[VELOCITY_P] = lambda _: part.mkdir(exist_ok=True)
+    outcome = session.command("write", session.out, "--yes")
+    assert outcome.code == 6, outcome.err
+    assert session.changed() == {}
+    part.rmdir()
+    assert session.command("restore", session.out).code == 0, "the journal could not be closed"
+    assert notes() == []
+
+
+# --- cut off, and restored -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("number", range(1, 2 * PER_DRIVE + 3))
+def test_restore_takes_a_write_back_that_was_cut_off_anywhere(session, cut_off, number):
+    cut_off(number, store=True)
+    power_cycle(session) if number % 2 else None
+    outcome = session.command("restore", session.out)
+    assert outcome.code == 0, outcome.err
+    assert "had been cut off" in outcome.out
+    assert "all drives hold the old values" in in_one_line(outcome.out)
+    assert session.changed() == {}
+    power_cycle(session)
+    assert session.changed() == {}
+    assert notes() == []
+
+
+def test_restore_says_what_each_drive_held_and_what_was_done(session, cut_off):
+    cut_off(PER_DRIVE + 2)  # the second drive has taken one value
+    outcome = session.command("restore", session.out, "--json")
+    assert outcome.code == 0
+    told = json.loads(outcome.out)
+    assert told["state"] == "old"
+    assert told["cut_off"] is True
+    table, arm = told["drives"]
+    assert (table["found"], arm["found"]) == ("new values", "old and new values mixed")
+    assert (len(table["brought_back"]), len(arm["brought_back"])) == (3, 1)
+    assert arm["non_volatile_memory"] == "untouched"
+    assert "old and new values mixed" in in_one_line(outcome.err)
+
+
+def test_values_that_are_neither_old_nor_new_are_said(session, cut_off):
+    cut_off(PER_DRIVE + 2)
+    session.machine.node(ARM).dictionary.write(*POSITION_P, 777)
+    outcome = session.command("restore", session.out)
+    assert "values that are neither old nor new" in in_one_line(outcome.out)
+    assert session.changed() == {}
+
+
+def test_a_drive_in_fault_is_restored_all_the_same(session, cut_off):
+    cut_off(PER_DRIVE + 2)
+    session.inject(DriveFault(ARM))
+    assert session.command("restore", session.out).code == 0
+
+
+def test_a_restore_that_is_not_whole_can_be_repeated(session, cut_off):
+    cut_off(2 * PER_DRIVE + 2, store=True)
+    arm = session.machine.node(ARM).dictionary
+    arm.guards[VELOCITY_P] = lambda _: session.inject(NodeVanishes(ARM))
+    outcome = session.command("restore", session.out)
+    assert outcome.code == 7, outcome.err
+    assert "arm (node 12) holds not known values" in outcome.err
+    assert "table (node 11) holds the old values" in outcome.err
+    assert session.command("restore", session.out).code == 3, "the node is absent"
+    arm.guards.clear()
+    session.machine.lift(NodeVanishes(ARM))
+    assert session.command("restore", session.out).code == 0
+    assert session.changed() == {}
+    power_cycle(session)
+    assert session.changed() == {}
+
+
+# --- the next session ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("command", ["write", "measure", "run"])
+def test_the_next_session_is_refused_until_it_is_taken_back(session, cut_off, command):
+    """In any folder: notes in the user's state folder say where the journal is."""
+    cut_off(PER_DRIVE + 2)
+    held = session.objects()
+    other = session.folder / "far" / "away"
+    make_session(session, other)
+    where = {"write": [other, "--yes"]}
+    arguments = where.get(command, [session.profile, "--yes", "--out", other])
+    outcome = session.command(command, *arguments)
+    assert outcome.code == 3
+    assert f"fieldtool restore {session.out}" in outcome.err
+    assert session.objects() == held, "nothing was written"
+    assert session.machine.sync_count == 0, "nothing was moved"
+    assert session.command("restore", session.out).code == 0
+    assert session.command("write", other, "--yes").code == 0
+
+
+def test_another_user_finds_it_in_the_folder_beside(session, cut_off):
+    cut_off(PER_DRIVE + 2)
+    shutil.rmtree(os.environ["FIELDTOOL_STATE_DIR"])
+    make_session(session, session.out.parent / "next")
+    outcome = session.command("write", session.out.parent / "next", "--yes")
+    assert outcome.code == 3
+    assert f"fieldtool restore {session.out}" in outcome.err
+
+
+def test_a_folder_that_was_moved_is_asked_for_and_works_where_it_is(session, cut_off):
+    cut_off(PER_DRIVE + 2)
+    moved = session.folder / "elsewhere" / "moved"
+    moved.parent.mkdir()
+    session.out.rename(moved)
+    other = session.folder / "far" / "away"
+    make_session(session, other)
+    outcome = session.command("write", other, "--yes")
+    assert outcome.code == 3
+    assert "If the folder was moved" in outcome.err
+    assert str(notes()[0]) in outcome.err
+    assert session.command("restore", moved).code == 0
+    assert session.changed() == {}
+    assert session.command("write", other, "--yes").code == 0
+
+
+@pytest.mark.parametrize("text", ["", "[", "format: x", "format: fieldtool-unfinished/1"])
+def test_a_note_that_can_not_be_read_is_named(session, cut_off, text):
+    cut_off(PER_DRIVE + 2)
+    notes()[0].write_text(text)
+    other = session.folder / "far" / "away"
+    make_session(session, other)
+    outcome = session.command("write", other, "--yes")
+    assert outcome.code == 3
+    assert str(notes()[0]) in outcome.err
+
+
+def test_notes_of_a_write_that_has_ended_are_forgotten(session, cut_off):
+    cut_off(PER_DRIVE + 2)
+    kept = {note: note.read_text() for note in notes()}
+    session.command("restore", session.out)
+    for note, text in kept.items():
+        note.write_text(text)
+    other = session.folder / "far" / "away"
+    make_session(session, other)
+    assert session.command("write", other, "--yes").code == 0
+    assert notes() == []
+
+
+# --- files are not trusted -----------------------------------------------------------------------
+
+
+def forged(path, change):
+    """Change a file as somebody would who knows how its checksum is made."""
+    data = yaml.safe_load(path.read_text())
+    change(data)
+    body = {key: value for key, value in data.items() if key not in ("format", "checksum")}
+    journal = data["format"].startswith("fieldtool-write-journal")
+    data["checksum"] = checksum(body if journal else data["drives"])
+    path.write_text(yaml.safe_dump(data, sort_keys=False))
+
+
+def entry(data, **changes):
+    data["drives"][1]["parameters"][0].update(changes)
+
+
+def held(data, **changes):
+    data["drives"][1]["objects"][0].update(changes)
+
+
+@pytest.mark.parametrize(
+    ("file", "change"),
+    [
+        ("write-journal.yaml", lambda d: entry(d, object="0x6040", type="UNSIGNED16", before=15)),
+        ("write-journal.yaml", lambda d: entry(d, object="0x1600:01")),
+        ("write-journal.yaml", lambda d: entry(d, object="0x5FFF:01")),
+        ("write-journal.yaml", lambda d: entry(d, type="REAL32")),
+        ("write-journal.yaml", lambda d: entry(d, type="UNSIGNED33")),
+        ("write-journal.yaml", lambda d: entry(d, before=float("nan"))),
+        ("write-journal.yaml", lambda d: entry(d, before=True)),
+        ("write-journal.yaml", lambda d: entry(d, before=-1)),
+        ("write-journal.yaml", lambda d: entry(d, before="1000")),
+        ("write-journal.yaml", lambda d: d.update(backup="../parameters-before.yaml")),
+        ("write-journal.yaml", lambda d: d.update(state="whatever")),
+        ("write-journal.yaml", lambda d: d.update(drives=[])),
+        ("write-journal.yaml", lambda d: d["drives"][1].update(phase=["writing"])),
+        ("write-journal.yaml", lambda d: d["drives"].pop() and d["drives"].append("arm")),
+        ("parameters-before.yaml", lambda d: held(d, object="0x6040", type="UNSIGNED16", value=15)),
+        ("parameters-before.yaml", lambda d: held(d, object="0x60FF", type="INTEGER32", value=9)),
+        ("parameters-before.yaml", lambda d: held(d, object="0x1A00:01", value=0)),
+        ("parameters-before.yaml", lambda d: held(d, type="REAL64", value=0.5)),
+        ("parameters-before.yaml", lambda d: held(d, value=float("inf"))),
+        ("parameters-before.yaml", lambda d: d["drives"][1].update(serial_number="1012")),
+        ("parameters-before.yaml", lambda d: d["drives"].pop()),
+    ],
+)
+def test_no_file_can_write_what_is_no_parameter(session, cut_off, file, change):
+    cut_off(PER_DRIVE + 2)
+    forged(session.out / file, change)
+    before = session.objects()
+    outcome = session.command("restore", session.out)
+    assert outcome.code == 2, outcome.err
+    assert file in outcome.err
+    assert session.objects() == before
+
+
+@pytest.mark.parametrize("damage", ["", "a: &a [*a]", "{}", "x" * 4_000_000, "\x00"])
+def test_without_its_journal_a_backup_comes_back_if_all_is_stored(session, cut_off, damage):
+    """What memory holds is then known only by storing anew, so that word is asked for."""
+    cut_off(2 * PER_DRIVE + 2, store=True)
+    (session.out / "write-journal.yaml").write_text(damage)
+    for source in (session.out, session.out / "parameters-before.yaml"):
+        outcome = session.command("restore", source)
+        assert outcome.code == 2, outcome.err
+        assert "write-journal.yaml" in outcome.err
+        assert "parameters-before.yaml --store" in outcome.err
+    outcome = session.command("restore", session.out / "parameters-before.yaml", "--store")
+    assert outcome.code == 0, outcome.err
+    power_cycle(session)
+    assert session.changed() == {}
+    assert notes() == []
+
+
+def test_a_journal_of_other_drives_is_refused(session, cut_off, make_bench):
+    cut_off(PER_DRIVE + 2)
+    other = make_bench(session.data | {}, serial=9999)
+    other.rewrite(other.data)
+    outcome = other.command("restore", session.out, "--machine", other.profile)
+    assert outcome.code == 3
+    assert "serial number 1011, this one has 9999" in outcome.err
+    assert other.changed() == {}
+
+
+def test_drives_without_a_serial_number_need_the_users_word(make_bench, monkeypatch):
+    bench = make_bench(serial=0)
+    make_session(bench, bench.out)
+    for _ in die_at(monkeypatch, PER_DRIVE + 2):
+        with pytest.raises(HostDiedError):
+            bench.command("write", bench.out, "--yes")
+    assert len(notes()) == 2
+    assert bench.command("write", bench.out, "--yes").code == 3
+    held_then = bench.objects()
+    outcome = bench.command("restore", bench.out)
+    assert outcome.code == 3
+    assert "table (node 11), arm (node 12): no serial number" in outcome.err
+    assert "--same-drives" in outcome.err
+    assert bench.objects() == held_then
+    assert bench.command("restore", bench.out, "--same-drives").code == 0
+    assert bench.changed() == {}
+    assert notes() == []
