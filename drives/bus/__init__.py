@@ -15,6 +15,7 @@ from drives.bus.load import (
     shortest_cycle,
 )
 from drives.bus.opening import open_bus
+from drives.bus.trouble import bus_state, trouble_of
 
 __all__ = [
     "MAX_CYCLIC_LOAD",
@@ -22,10 +23,12 @@ __all__ = [
     "Clock",
     "CyclicLoad",
     "WallClock",
+    "bus_state",
     "check_cycle",
     "clock_of",
     "frame_bits",
     "not_imitated",
     "open_bus",
     "shortest_cycle",
+    "trouble_of",
 ]

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 
 import can
 
+from drives.bus.kernel_link import kernel_links
+
 _TIMEOUT, _CONTROLLER, _PROTOCOL = 0x001, 0x004, 0x008
 _TRANSCEIVER, _NO_ACK, _BUS_OFF, _BUS_ERROR, _RESTARTED = 0x010, 0x020, 0x040, 0x080, 0x100
 _OVERFLOW = {0x01: "the adapter's receive buffer ran over", 0x02: "its transmit buffer ran over"}
@@ -66,3 +68,18 @@ def trouble_of(message: can.Message, socketcan: bool) -> Trouble:
         overrun=bool(flags & 0x01),
         matters=bool(words),
     )
+
+
+def bus_state(bus: can.BusABC) -> str:
+    """Return the adapter's state in words where it is not well, as far as it tells; else nothing."""
+    channel = getattr(bus, "channel", None)
+    if hasattr(bus, "overruns") and isinstance(channel, str):
+        links = kernel_links(channel) or ()
+        states = [link.state for link in links if link.state not in (None, "error active")]
+        return states[0] or "" if states else ""
+    try:
+        state = bus.state
+    except Exception:  # many adapters do not tell, each in its own way
+        return ""
+    words = {can.BusState.PASSIVE: "error passive", can.BusState.ERROR: "off the bus or in error"}
+    return words.get(state, "")

@@ -273,8 +273,8 @@ class CanopenDrive:
             return self.read_int(objects.DEVICE_TYPE)
         except SdoTimeoutError:
             raise NodeAbsentError(
-                f"{self.axis}: node {self.node_id} does not answer. Check its supply, its cable, its "
-                "node id and the bit rate."
+                f"{self.axis}: node {self.node_id} does not answer. {self.line.diagnosis()} Check its "
+                "supply, its cable, its node id and the bit rate.".replace("  ", " ")
             ) from None
 
     def wait(self, seconds: float) -> None:

@@ -14,6 +14,7 @@ from drives.canopen_drive.drive import CanopenDrive
 from drives.canopen_drive.interrupts import uninterrupted
 from drives.canopen_drive.line import Line
 from drives.canopen_drive.motion import CanopenMotion
+from drives.canopen_drive.pace import Punctuality, undisturbed
 from drives.canopen_drive.torque_offset import why_not
 from drives.cia402 import Mode
 from drives.errors import DrivesError, LimitsError, NothingMovedError, NotSupportedError
@@ -21,6 +22,7 @@ from drives.objects import ObjectInfo
 from drives.profile import AxisProfile, DriveProfile, MachineProfile, load_drive
 from drives.trace import traced
 
+SYNC_ID = 0x080
 START_NODE, ENTER_PRE_OPERATIONAL = 0x01, 0x80
 LISTENING_TIME = 0.3
 """Seconds for which the bus is listened to before anything is changed."""
@@ -44,13 +46,18 @@ class CanopenGroup:
         self._drives, self._stop_requested = tuple(drives), stop_requested
         self.warnings: list[str] = []
         """What could not be put back, in words."""
-        self.late_cycles = 0
-        """Cycles of all motions so far that the host began more than half a cycle late."""
+        self.punctuality = Punctuality()
+        """How well the host has kept the cycles of all motions so far."""
 
     @property
     def drives(self) -> tuple[CanopenDrive, ...]:
         """One drive an axis, in the machine profile's order."""
         return self._drives
+
+    @property
+    def late_cycles(self) -> int:
+        """Cycles of all motions so far that the host began late."""
+        return self.punctuality.late
 
     @property
     def axes(self) -> tuple[str, ...]:
@@ -163,8 +170,10 @@ class CanopenGroup:
                 self.line, self._drives, cycle_time, frozenset(free), self._stop_requested, offsets
             )
             motion.perhaps_enabled = unsure
+            motion.real_time = stack.enter_context(undisturbed(self.line.clock))
+            stack.enter_context(self.line.only(_identifiers(self._drives)))
             self.line.begin_heartbeat(setup.HOST_NODE_ID, setup.HOST_HEARTBEAT)
-            stack.callback(self._note_late_cycles, motion)
+            stack.callback(self._note_punctuality, motion)
             stack.callback(motion.end)
             try:
                 motion.begin()
@@ -236,8 +245,8 @@ class CanopenGroup:
         else:
             self._put_back(changes)
 
-    def _note_late_cycles(self, motion: CanopenMotion) -> None:
-        self.late_cycles += motion.late_cycles
+    def _note_punctuality(self, motion: CanopenMotion) -> None:
+        self.punctuality = self.punctuality.plus(motion.punctuality)
 
     def _warn(self, text: str) -> None:
         if text not in self.warnings:
@@ -248,6 +257,12 @@ class CanopenGroup:
             drive.node.nmt.send_command(ENTER_PRE_OPERATIONAL)
         except DrivesError as error:
             self._warn(f"{drive.axis}: {error}")
+
+
+def _identifiers(drives: Sequence[CanopenDrive]) -> list[int]:
+    """What matters while axes move: SYNC, and each drive's emergencies, PDO, SDO and heartbeat."""
+    services = (0x080, 0x180, 0x580, 0x700)
+    return [SYNC_ID, *(service + d.node_id for d in drives for service in services)]
 
 
 @contextmanager

@@ -5,14 +5,15 @@ while periodic frames go on.  Here whoever waits receives, so an error of the bu
 it matters, and time is the bus' own.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager, suppress
 from math import inf
 
 import can
 import canopen
 from canopen.sdo import SdoClient, SdoCommunicationError
 
-from drives.bus import Clock, clock_of
+from drives.bus import Clock, bus_state, clock_of, trouble_of
 from drives.errors import BusError
 
 NMT_OPERATIONAL = 5
@@ -30,6 +31,11 @@ class Line(canopen.Network):  # type: ignore[misc]
         super().__init__(bus)
         self.can_bus = bus
         self.clock: Clock = clock_of(bus)
+        self.frames = 0
+        """Frames received."""
+        self.troubles: dict[str, int] = {}
+        """Error frames: what they said, and how often."""
+        self._lost = 0
         self._beat: can.Message | None = None
         self._next_beat = self._beat_period = 0.0
 
@@ -73,12 +79,73 @@ class Line(canopen.Network):  # type: ignore[misc]
             )
         )
 
-    def pump(self, timeout: float) -> can.Message | None:
-        """Receive at most one frame, hand it on to those who subscribed, and return it."""
+    def receive(self, timeout: float) -> can.Message | None:
+        """Receive at most one frame, and return it.
+
+        Raises
+        ------
+        BusError
+            If the bus delivers none any more, or the adapter has switched itself off the bus.
+        """
         try:
             message = self.can_bus.recv(timeout)
         except (can.CanError, OSError) as error:
             raise BusError(f"the bus does not deliver frames any more: {error}") from error
+        if message is not None:
+            self.frames += 1
+            if message.is_error_frame:
+                self._take_trouble(message)
+        return message
+
+    def _take_trouble(self, message: can.Message) -> None:
+        trouble = trouble_of(message, hasattr(self.can_bus, "overruns"))
+        if trouble.matters:
+            self.troubles[trouble.words] = self.troubles.get(trouble.words, 0) + 1
+        self._lost += trouble.overrun
+        if trouble.bus_off:
+            raise BusError(
+                f"the adapter went off the bus: {trouble.words}. Check cable, terminators and bit rate."
+            )
+
+    @property
+    def overruns(self) -> int:
+        """Received frames that were lost since the bus was opened, as far as the adapter tells."""
+        return int(getattr(self.can_bus, "overruns", 0)) + self._lost
+
+    @contextmanager
+    def only(self, identifiers: Collection[int]) -> Iterator[None]:
+        """Receive frames of these identifiers only, where the bus can leave the others out.
+
+        A bus that is traced takes every frame.
+        """
+        focus = getattr(type(self.can_bus), "focus", None)
+        if focus is None:
+            yield
+            return
+        focus(self.can_bus, identifiers)
+        try:
+            yield
+        finally:
+            with suppress(can.CanError, OSError):
+                focus(self.can_bus, None)
+
+    def diagnosis(self) -> str:
+        """Return in a sentence what the bus shows, where a node is silent; empty if it is quiet."""
+        state = bus_state(self.can_bus)
+        if self.troubles:
+            said = ", ".join(f"{text} ({count} times)" for text, count in self.troubles.items())
+            return f"There were error frames: {said}. The bit rate is most likely another one."
+        if state:
+            return (
+                f"The adapter is {state}: nobody acknowledges its frames, or the bit rate is wrong."
+            )
+        if not self.frames:
+            return "Nothing at all was heard on this bus."
+        return ""
+
+    def pump(self, timeout: float) -> can.Message | None:
+        """Receive at most one frame, hand it on to those who subscribed, and return it."""
+        message = self.receive(timeout)
         if message is not None and not (
             message.is_error_frame or message.is_remote_frame or message.is_extended_id
         ):

@@ -16,10 +16,10 @@ from drives.canopen_drive.drive import CanopenDrive
 from drives.canopen_drive.interrupts import uninterrupted
 from drives.canopen_drive.line import Line
 from drives.canopen_drive.outputs import Outputs, outputs_of
-from drives.canopen_drive.setup import HOST_LOST_AFTER
+from drives.canopen_drive.pace import Pace, Punctuality
+from drives.canopen_drive.setup import HOST_HEARTBEAT, HOST_LOST_AFTER
 from drives.cia402 import ENABLED_VALUE, STEP_TOWARDS_ENABLED, Controlword, PowerState
 from drives.errors import (
-    BusError,
     DriveFaultError,
     DrivesError,
     SafetyStopError,
@@ -36,8 +36,9 @@ STOP_TIMEOUT = 5.0
 RUNAWAY_SHARE, RUNAWAY_GROWTH, RUNAWAY_CYCLES = 0.25, 1.25, 3
 """An axis runs away that, for so many cycles of a quick stop, is faster than this share of its
 velocity limit and than it was at the start of the stop times the growth."""
-LATE_SHARE = 0.25
-"""Share of a cycle by which the host may be late; a block with a later cycle is measured again."""
+MOST_LATE = HOST_LOST_AFTER - HOST_HEARTBEAT
+"""Seconds by which a cycle may begin late: drives that miss the host for longer stop by themselves,
+and after such a pause the targets would go on from where the axes have long been at rest."""
 PAUSE_CYCLES, REPLY_TRIES = 3, 3
 """Cycles without SYNC before the drives' replies are timed, and tries to find them in time."""
 REPLY_SHARE = 0.9
@@ -63,13 +64,15 @@ class CanopenMotion:
         self._by_cob = {0x180 + c.drive.node_id: k for k, c in enumerate(self._channels)}
         self._by_node = {c.drive.node_id: c for c in self._channels}
         self._sync = can.Message(arbitration_id=0x80, is_extended_id=False)
-        self._start = 0.0
+        self._pace = Pace(line.clock, cycle_time)
+        self._lost = line.overruns
+        self._lost_before = self._lost
         self._count = 0
         self._stopped = False
         self.perhaps_enabled: dict[str, str] = {}
         """Axes whose drive could not be seen to be off after a stop: a sentence each."""
-        self.late_cycles = 0
-        """Cycles that the host began later than LATE_SHARE of a cycle."""
+        self.real_time = ""
+        """Why the host has no real-time priority; empty where it has."""
 
     # --- what the outside sees -----------------------------------------------------------------
 
@@ -82,6 +85,19 @@ class CanopenMotion:
     def position(self) -> FloatArray:
         """Latest actual positions, shape (M,), rad or m."""
         return np.array([c.position * c.drive.scaling.position for c in self._channels])
+
+    @property
+    def punctuality(self) -> Punctuality:
+        """How well the host has kept its cycles so far."""
+        pace = self._pace
+        return Punctuality(
+            pace.cycles,
+            pace.late,
+            pace.worst,
+            self._cycle_time,
+            self._line.overruns - self._lost_before,
+            self.real_time,
+        )
 
     @property
     def free(self) -> tuple[bool, ...]:
@@ -125,7 +141,8 @@ class CanopenMotion:
             If an axis leaves a limit as soon as it is enabled; all are disabled.
         """
         now = self._line.clock.now()
-        self._start, self._count = now + self._cycle_time, 0
+        self._count = 0
+        self._pace.restart()
         for channel in self._channels:
             node_id = channel.drive.node_id
             channel.heard = now
@@ -160,7 +177,7 @@ class CanopenMotion:
         taken for the next cycle's ever after.
         """
         self._line.wait(PAUSE_CYCLES * self._cycle_time)
-        self._start = self._line.clock.now() + (1 - self._count) * self._cycle_time
+        self._pace.restart()
         words = [self._word(c, Controlword.DISABLE_VOLTAGE) for c in self._channels]
         for _ in range(REPLY_TRIES):
             if self._cycle(words):
@@ -362,24 +379,22 @@ class CanopenMotion:
 
     def _cycle(self, outputs: Sequence[bytes]) -> bool:
         """Send outputs, then SYNC, then take every drive's input; return whether all came."""
-        line, clock = self._line, self._line.clock
+        line = self._line
         for channel, output in zip(self._channels, outputs, strict=True):
             channel.output.data = bytearray(output)
             line.send(channel.output)
-        moment = self._start + self._count * self._cycle_time
         line.beat()
-        clock.wait_until(moment - 1e-7)
-        late = clock.now() - moment
-        is_late = late > LATE_SHARE * self._cycle_time
-        if is_late:
-            self.late_cycles += 1
-            self._start += late
-            moment += late
+        moment = self._pace.begin()
         disturbed = self._take_late_frames()
         line.send(self._sync)
         self._count += 1
         complete = self._collect(moment + REPLY_SHARE * self._cycle_time)
-        return complete and not is_late and not disturbed
+        return complete and not self._pace.lateness and not disturbed and not self._lost_frames()
+
+    def _lost_frames(self) -> bool:
+        """Whether received frames were lost since this was asked last."""
+        before, self._lost = self._lost, self._line.overruns
+        return self._lost != before
 
     def _take_late_frames(self) -> bool:
         """Hand on what came since the last cycle; return whether a drive's PDO was among it.
@@ -387,7 +402,7 @@ class CanopenMotion:
         That PDO came too late for its SYNC, or the drive answered a SYNC that is not ours.
         """
         disturbed = False
-        while (message := self._receive(0.0)) is not None:
+        while (message := self._line.receive(0.0)) is not None:
             if message.arbitration_id in self._by_cob and not message.is_extended_id:
                 disturbed = True
             else:
@@ -398,7 +413,7 @@ class CanopenMotion:
         by_cob, channels, clock = self._by_cob, self._channels, self._line.clock
         awaited = set(by_cob.values())
         while awaited:
-            message = self._receive(max(0.0, deadline - clock.now()))
+            message = self._line.receive(max(0.0, deadline - clock.now()))
             if message is None:
                 break
             k = by_cob.get(message.arbitration_id)
@@ -410,12 +425,6 @@ class CanopenMotion:
         for k in awaited:
             channels[k].missing += 1
         return not awaited
-
-    def _receive(self, timeout: float) -> can.Message | None:
-        try:
-            return self._line.can_bus.recv(timeout)
-        except (can.CanError, OSError) as error:
-            raise BusError(f"the bus does not deliver frames any more: {error}") from error
 
     def _hand_on(self, message: can.Message) -> None:
         if not (message.is_error_frame or message.is_remote_frame or message.is_extended_id):
@@ -440,6 +449,15 @@ class CanopenMotion:
         if channel.nmt_state == 0:
             channel.rebooted = True
 
+    def _check_lateness(self) -> None:
+        if self._pace.lateness > MOST_LATE:
+            raise SafetyStopError(
+                f"this computer stood still for {1000 * self._pace.lateness:.0f} ms; a cycle may begin "
+                f"{1000 * MOST_LATE:.0f} ms late at most. All axes were stopped. Close other programs, "
+                "switch power saving off, and start again.",
+                cycle=self._count - 1,
+            )
+
     def _check_user(self) -> None:
         if self._stop_requested():
             raise UserStopError(
@@ -450,6 +468,7 @@ class CanopenMotion:
     def _check(self, targets: np.ndarray[tuple[int], np.dtype[np.int32]]) -> None:
         """Raise SafetyStopError for the first thing that is not as it has to be."""
         self._check_user()
+        self._check_lateness()
         now = self._line.clock.now()
         for channel, target in zip(self._channels, targets.tolist(), strict=True):
             if not channel.is_fine(target, now):

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import can
 
+from drives.bus import WallClock
+from drives.canopen_drive.pace import undisturbed
 from drives.sim.running import RunningMachine
 from drives.sim.scheduler import NANOSECONDS, nanoseconds
 
@@ -81,6 +83,17 @@ def serve(
         Seconds that never go back.
     """
     _compile(machine)
+    with undisturbed(WallClock()):
+        return _served(machine, bus, stop, begun, clock)
+
+
+def _served(
+    machine: RunningMachine,
+    bus: can.BusABC,
+    stop: Callable[[], bool],
+    begun: Callable[[], None],
+    clock: Callable[[], float],
+) -> Served:
     line = _Line(machine, bus)
     begun()
     began, virtual_began = clock(), machine.time

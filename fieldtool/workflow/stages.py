@@ -2,8 +2,10 @@
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 
+from drives.bus import not_imitated
 from drives.canopen_drive import CanopenGroup, connect
 from drives.errors import UserStopError
 from drives.parameters import Change
@@ -11,6 +13,7 @@ from drives.profile import MachineProfile, load_machine
 from fieldtool.design.tuning import Tuning, design
 from fieldtool.design.tuning_file import read_tuning, tuning_as_dict
 from fieldtool.errors import (
+    FieldtoolError,
     FileFormatError,
     IdentificationError,
     NotEnoughDataError,
@@ -84,11 +87,6 @@ def run(
         group,
     ):
         machine_time = _measured(session, group, options)
-        if group.late_cycles:
-            session.warn(
-                f"{group.late_cycles} cycles began late on this computer; the blocks with them were "
-                "measured again. Close other programs, or use a longer cycle."
-            )
         identified = _identify(session, options)
         session.screen.found(identified.model, truth_model(session.machine))
         session.screen.stage("Design new controller parameters")
@@ -261,9 +259,27 @@ def restore(
 
 
 def _measured(session: Session, group: CanopenGroup, options: Options) -> float:
-    if options.plan == "fast":
-        return measured_fast(session, group, options)
-    return measured(session, group)
+    try:
+        if options.plan == "fast":
+            seconds = measured_fast(session, group, options)
+        else:
+            seconds = measured(session, group)
+    except BaseException:
+        with suppress(FieldtoolError):  # a full disk must not hide why it ended
+            _tell_punctuality(session, group)
+        raise
+    _tell_punctuality(session, group)
+    return seconds
+
+
+def _tell_punctuality(session: Session, group: CanopenGroup) -> None:
+    """Say how well this computer kept its cycles; a simulated machine's time passes as it is told."""
+    kept = group.punctuality
+    session.folder.note("cycles", count=kept.cycles, late=kept.late, worst=kept.worst)
+    if kept.advice:
+        session.warn(f"{kept.sentence} {kept.advice}")
+    elif kept.cycles and not not_imitated(group.line.can_bus):
+        session.screen.say(kept.sentence)
 
 
 def _identify(session: Session, options: Options) -> Identified:
