@@ -1,0 +1,188 @@
+"""What only the kernel's own bus has: time stamps, filters, overruns, links that are down."""
+
+import contextlib
+import os
+import pty
+import shutil
+import subprocess
+import threading
+import time
+import tty
+from pathlib import Path
+
+import can
+import numpy as np
+import pytest
+
+from drives.bus import open_bus
+from drives.bus.kernel_bus import KernelBus
+from drives.bus.kernel_link import kernel_links
+from drives.canopen_drive import connect
+from drives.canopen_drive.line import Line
+from drives.errors import BusError
+from drives.profile import BusProfile, load_machine
+from tests.socketcan.conftest import CYCLE, MACHINE, TABLE, link
+
+
+def opened(channel: str = "vcan1") -> KernelBus:
+    bus = open_bus(BusProfile(interface="socketcan", channel=channel))
+    assert isinstance(bus, KernelBus)
+    return bus
+
+
+def frame(identifier: int, data: bytes = b"") -> can.Message:
+    return can.Message(arbitration_id=identifier, data=data, is_extended_id=False)
+
+
+def test_the_kernel_tells_its_interfaces() -> None:
+    names = {one.name: one for one in kernel_links() or ()}
+    assert names["vcan1"].kind == "vcan"
+    assert names["vcan1"].up
+    assert names["vcan1"].bitrate is None
+    assert kernel_links("vcan1") == (names["vcan1"],)
+
+
+def test_time_stamps_are_those_of_the_arrival() -> None:
+    with opened() as near, opened() as far:
+        for k in range(3):
+            far.send(frame(0x123, bytes([k])))
+            time.sleep(0.05)
+        time.sleep(0.3)
+        read = time.time()
+        stamps = [message.timestamp for _ in range(3) if (message := near.recv(1.0))]
+    assert len(stamps) == 3
+    assert read - stamps[-1] > 0.3, "not the time at which it was read"
+    assert np.diff(stamps) == pytest.approx([0.05, 0.05], abs=0.04)
+
+
+def test_frames_that_nobody_wants_are_left_to_the_kernel() -> None:
+    with opened() as near, opened() as far:
+        with Line(near).only([0x18B, 0x70B]):
+            for identifier in (0x18B, 0x18C, 0x70B):
+                far.send(frame(identifier))
+            far.send(can.Message(arbitration_id=0x18B, is_extended_id=True))
+            got = [m.arbitration_id for _ in range(5) if (m := near.recv(0.05))]
+        assert got == [0x18B, 0x70B]
+        far.send(frame(0x18C))
+        message = near.recv(1.0)
+    assert message is not None
+    assert message.arbitration_id == 0x18C
+
+
+def test_the_receive_buffer_has_room_for_half_a_second_of_a_full_bus() -> None:
+    with opened() as near, opened() as far:
+        assert near.room >= 4000
+        for k in range(3000):
+            far.send(frame(0x100 + k % 7))
+        taken = sum(1 for _ in range(3000) if near.recv(0.2))
+        assert taken == 3000
+        assert near.overruns == 0
+
+
+def test_an_overrun_is_counted() -> None:
+    with opened() as near, opened() as far:
+        near.socket.setsockopt(1, 8, 4096)  # SO_RCVBUF: a few frames
+        line = Line(near)
+        for _ in range(500):
+            far.send(frame(0x123))
+        taken = 0
+        while line.receive(0.05) is not None:
+            taken += 1
+        far.send(frame(0x123))  # the kernel tells with the next frame
+        assert line.receive(1.0) is not None
+        assert taken < 400
+        assert line.overruns == 500 - taken
+
+
+def test_a_cycle_that_lost_frames_is_spoiled_and_the_motion_goes_on(drives) -> None:
+    """A flood that the filter lets through, while the host does not look."""
+    machine = load_machine(MACHINE)
+    bus = opened("vcan0")
+    with bus, opened("vcan0") as other, connect(machine, bus) as group:
+        with group.motion(CYCLE) as motion:
+            hold = np.tile(motion.position, (20, 1))
+            lost: list[int] = []
+
+            def source(before):
+                lost.append(bus.overruns)
+                blocks = len(lost)
+                if blocks == 2:
+                    bus.socket.setsockopt(1, 8, 4096)
+                    for _ in range(200):
+                        other.send(frame(0x500 + TABLE))  # left out by the filter
+                if blocks == 3:
+                    for _ in range(200):
+                        other.send(frame(0x700 + TABLE, b"\x05"))
+                return hold if blocks < 6 else None
+
+            capture = motion.stream(source)
+        kept = group.punctuality
+    assert capture.rows == 100
+    assert lost[2] == 0, "what the filter leaves out does no harm"
+    assert 40 in capture.missing, "the flood was seen"
+    assert kept.overruns > 50
+    assert "received frames were lost" in kept.sentence
+
+
+def test_an_interface_that_is_down_or_missing_is_refused(up_again) -> None:
+    link("vcan1", "down")
+    with pytest.raises(BusError, match=r"vcan1 is down. Bring it up: `ip link set vcan1 up`"):
+        opened()
+    with pytest.raises(BusError, match=r"vcan7 does not exist; CAN interfaces .*: vcan0, vcan1"):
+        opened("vcan7")
+
+
+def test_an_interface_that_goes_down_is_noticed(up_again) -> None:
+    with opened() as near, opened() as other:
+        line = Line(near)
+        link("vcan1", "down")
+        with pytest.raises(BusError, match="frames any more: interface vcan1 is down"):
+            line.receive(1.0)
+        with pytest.raises(BusError, match="interface vcan1 is down"):
+            Line(other).send(frame(0x123))
+
+
+def drained(terminal: int) -> None:
+    """Take what the kernel sends to the adapter that is not there."""
+    with contextlib.suppress(OSError):
+        while os.read(terminal, 4096):
+            pass
+
+
+@pytest.fixture
+def slcan():
+    """A CAN interface with a bit rate: the kernel's serial-line CAN on a pseudo-terminal."""
+    if shutil.which("slcand") is None:
+        pytest.skip("needs slcand (can-utils)")
+    if not Path("/sys/module/slcan").exists():
+        modules = list(Path("/usr/lib/uml/modules").glob("*/kernel/drivers/net/can/slcan/slcan.ko"))
+        if modules:
+            subprocess.run(["busybox", "insmod", str(modules[-1])], check=False)
+    near, far = pty.openpty()
+    tty.setraw(near)
+    tty.setraw(far)
+    threading.Thread(target=drained, args=(near,), daemon=True).start()
+    daemon = subprocess.Popen(["slcand", "-F", os.ttyname(far), "slcan0"])
+    try:
+        deadline = time.monotonic() + 10.0
+        while not kernel_links("slcan0"):
+            if daemon.poll() is not None or time.monotonic() > deadline:
+                pytest.skip("this kernel has no slcan")
+            time.sleep(0.1)
+        yield "slcan0"
+    finally:
+        daemon.terminate()
+        daemon.wait(10.0)
+        os.close(far)
+        os.close(near)
+
+
+def test_another_bit_rate_than_the_profile_s_is_refused(slcan: str) -> None:
+    link(slcan, "type", "can", "bitrate", "500000")
+    link(slcan, "up")
+    (found,) = kernel_links(slcan) or ()
+    assert (found.bitrate, found.up) == (500_000, True)
+    wrong = BusProfile(interface="socketcan", channel=slcan, bitrate=250_000)
+    with pytest.raises(BusError, match="is set to 500000 bit/s, the machine profile says 250000"):
+        open_bus(wrong)
+    open_bus(BusProfile(interface="socketcan", channel=slcan, bitrate=500_000)).shutdown()
