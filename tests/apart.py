@@ -175,7 +175,7 @@ class MachineApart:
         os.environ |= self._environment
         if quick:
             self._context = multiprocessing.get_context("forkserver")
-            self._context.set_forkserver_preload(["fieldtool.cli.main", "matplotlib.pyplot"])
+            self._context.set_forkserver_preload(["__main__", "fieldtool.cli.main"])
 
     def _described(self) -> dict[str, Any]:
         return {

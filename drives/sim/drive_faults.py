@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 
 from drives.sim.emergency import ErrorRegister
 from drives.sim.faults import Fault
+from drives.sim.memory import Bank
 from drives.sim.state_machine import State, Status
 
 if TYPE_CHECKING:
@@ -115,17 +116,20 @@ class CanNotBeEnabled(Fault):
 
 @dataclass(frozen=True)
 class PowerLossWhileStoring(Fault):
-    """The drive's supply fails as soon as it has begun to store its parameters."""
+    """The drive's supply fails the next time that it stores its parameters; it boots then."""
 
     after: float = 0.05
     """s after storing began."""
+    bank: Bank = "old"
+    """What its memory holds then: what was there before, what was to be stored, or neither."""
 
     def set(self, machine: "RunningMachine", *, present: bool) -> None:
         """Lie in wait, or not."""
         node = machine.node(self.node_id)
 
         def at_store() -> None:
-            machine.scheduler.add(self.after, node.power_cycle)
+            node.on_store = None
+            machine.scheduler.add(self.after, node.power_cycle, (self.bank,))
 
         node.on_store = at_store if present else None
 

@@ -8,6 +8,7 @@ import pytest
 import yaml
 
 from drives.canopen_drive import CanopenDrive
+from drives.sim.drive_faults import PowerLossWhileStoring
 from drives.sim.faults import (
     Fault,
     NodeVanishes,
@@ -17,7 +18,6 @@ from drives.sim.faults import (
     StoreFails,
     WriteAltered,
 )
-from drives.sim.memory_faults import PowerLossWhileStoring
 
 TABLE, ARM = 11, 12
 VELOCITY_P, VELOCITY_I, POSITION_P = (0x2010, 2), (0x2010, 3), (0x2010, 1)
@@ -415,7 +415,7 @@ def test_a_supply_that_fails_while_storing_leaves_old_values_everywhere(session,
         each.dictionary.write(*VELOCITY_P, 1300)  # not the factory's: those would show
         each.memory.save(each.dictionary)
     session.before = session.objects()
-    session.inject(PowerLossWhileStoring(node, bank))
+    session.inject(PowerLossWhileStoring(node, bank=bank))
     outcome = write(session, "--store")
     assert outcome.code == 6, outcome.err
     assert "did not answer" in outcome.err
