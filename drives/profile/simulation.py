@@ -21,6 +21,10 @@ class SimulatedAxisProfile(Part):
     rated_torque: Positive
     peak_torque: Positive
     torque_noise: NotNegative = 0.0
+    torque_constant: Positive = 0.1
+    """N m/A (or N/A) of the motor, for drives that know currents."""
+    face: str | None = None
+    """Kind of drive that is simulated; else that of the axis' drive profile."""
     encoder_counts_per_rev: Annotated[int, Field(ge=16, le=2**30)] = 2**20
     gains: dict[str, Number] = Field(default_factory=dict)
     """Start values of the drive's parameters by name, physical units."""

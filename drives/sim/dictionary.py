@@ -7,7 +7,7 @@ wrong in a callback is swallowed.
 """
 
 import struct
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from math import isnan
 from typing import Any
 
@@ -15,7 +15,7 @@ from durand.datatypes import is_numeric, struct_dict
 from durand.object_dictionary import ObjectDictionary, Record, Variable
 
 from drives.sim.abort_codes import Abort, refuse
-from drives.sim.entries import ENTRIES, OBJECTS, Entry
+from drives.sim.entries import OBJECTS, Entry, ObjectEntry
 
 Key = tuple[int, int]
 """Index and sub-index."""
@@ -66,6 +66,10 @@ class DriveDictionary(ObjectDictionary):  # type: ignore[misc]  # durand is not 
     overrides
         Values that differ from the tables' defaults on this very drive, by key: the factory
         settings, which 0x1011 goes back to.
+    objects
+        Its objects.
+    hidden
+        Entries that the drive works with and that nobody outside sees.
 
     Raises
     ------
@@ -73,9 +77,22 @@ class DriveDictionary(ObjectDictionary):  # type: ignore[misc]  # durand is not 
         If an override names an entry that does not exist.
     """
 
-    def __init__(self, node_id: int, overrides: Mapping[Key, Value]) -> None:
+    def __init__(
+        self,
+        node_id: int,
+        overrides: Mapping[Key, Value],
+        objects: Sequence[ObjectEntry] = OBJECTS,
+        hidden: frozenset[Key] = frozenset(),
+    ) -> None:
         super().__init__()
-        unknown = [f"0x{i:04X}:{s:02X}" for i, s in overrides if (i, s) not in ENTRIES]
+        self.entries = {e.key: e for described in objects for e in described.entries}
+        self.hidden = hidden
+        self._hidden_objects = {
+            described.index
+            for described in objects
+            if all(entry.key in hidden for entry in described.entries)
+        }
+        unknown = [f"0x{i:04X}:{s:02X}" for i, s in overrides if (i, s) not in self.entries]
         if unknown:
             raise KeyError(f"the simulated drive has no object {', '.join(unknown)}")
         self.guards: dict[Key, Guard] = {}
@@ -84,7 +101,7 @@ class DriveDictionary(ObjectDictionary):  # type: ignore[misc]  # durand is not 
         """What a faulty drive makes of a written value (fault injection)."""
         self._overrides = dict(overrides)
         self.node_id = node_id
-        for described in OBJECTS:
+        for described in objects:
             if described.is_variable:
                 self[described.index] = self._variable(described.entries[0])
                 continue
@@ -92,13 +109,15 @@ class DriveDictionary(ObjectDictionary):  # type: ignore[misc]  # durand is not 
             for entry in described.entries:
                 record[entry.subindex] = self._variable(entry)
             self[described.index] = record
+        for key in hidden:
+            self._data[key] = self.factory_value(self.entries[key])
 
     def set_node_id(self, node_id: int) -> None:
         """Make the defaults that depend on the node id anew."""
         self.node_id = node_id
-        for entry in ENTRIES.values():
+        for entry in self.entries.values():
             if entry.plus_node_id:
-                self.lookup(*entry.key).value = self.factory_value(entry)
+                self._find(*entry.key).value = self.factory_value(entry)
 
     def _variable(self, entry: Entry) -> DriveVariable:
         return DriveVariable(entry, self.factory_value(entry))
@@ -109,7 +128,22 @@ class DriveDictionary(ObjectDictionary):  # type: ignore[misc]  # durand is not 
         return entry.default_for(self.node_id) if override is None else override
 
     def lookup(self, index: int, subindex: int | None = None) -> Any:
-        """Return the object or, with a sub-index, its variable; raise KeyError if none is there."""
+        """Return the object or, with a sub-index, its variable, as others see it.
+
+        Raises
+        ------
+        KeyError
+            If none is there, or it is hidden.
+        """
+        if index in self._hidden_objects or (index, subindex or 0) in self.hidden:
+            raise KeyError(f"0x{index:04X}:{subindex or 0:02X} is not shown")
+        return self._find(index, subindex)
+
+    def shows(self, key: Key) -> Entry | None:
+        """Return an entry that others see, None if there is none."""
+        return None if key in self.hidden else self.entries.get(key)
+
+    def _find(self, index: int, subindex: int | None = None) -> Any:
         if subindex and index in self._variables:
             raise KeyError(f"0x{index:04X} is a variable: it has no sub-index {subindex}")
         return super().lookup(index, subindex)
@@ -127,7 +161,7 @@ class DriveDictionary(ObjectDictionary):  # type: ignore[misc]  # durand is not 
             If there is no such entry.
         """
         key = (index, subindex)
-        entry = ENTRIES[key]
+        entry = self.entries[key]
         if not downloaded:
             self._check_range(entry, value)
         if entry.choices and value not in entry.choices:
@@ -147,7 +181,7 @@ class DriveDictionary(ObjectDictionary):  # type: ignore[misc]  # durand is not 
     def _check_range(self, entry: Entry, value: Value) -> None:
         if isinstance(value, bytes):
             return
-        variable = self.lookup(entry.index, entry.subindex)
+        variable = self._find(entry.index, entry.subindex)
         if variable.minimum is not None and value < variable.minimum:
             raise refuse(Abort.TOO_LOW, *entry.key)
         if variable.maximum is not None and value > variable.maximum:
@@ -159,12 +193,12 @@ class DriveDictionary(ObjectDictionary):  # type: ignore[misc]  # durand is not 
 
     def parameters(self) -> dict[Key, Value]:
         """Return the values of all entries that can be stored."""
-        return {key: self.read(*key) for key, entry in ENTRIES.items() if entry.is_parameter}
+        return {key: self.read(*key) for key, entry in self.entries.items() if entry.is_parameter}
 
     def load(self, values: Mapping[Key, Value], keys: Iterable[Key]) -> None:
         """Set entries to stored values, or to factory ones where nothing is stored; no effects."""
         for key in keys:
-            entry = ENTRIES[key]
+            entry = self.entries[key]
             self._data[key] = values.get(key, self.factory_value(entry))
 
 

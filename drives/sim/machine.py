@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from math import isfinite, pi
+from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Literal
 
@@ -31,9 +32,11 @@ from drives.sim.effects import (
     TorqueScale,
 )
 from drives.sim.entries import ENTRIES
+from drives.sim.faces import REFERENCE, Face, Motor, face_of
+from drives.sim.faces.face import Loops
 from drives.sim.firmware import DriveHardware
 from drives.sim.plant import ChainParameters, PlantParameters
-from drives.sim.scales import Scales, gain_objects
+from drives.sim.scales import Scales
 
 if TYPE_CHECKING:
     from drives.profile import EffectProfile, MachineEffectProfile, MachineProfile
@@ -43,17 +46,10 @@ Kind = Literal["rotary", "linear"]
 _STANDARD_RESOLUTION = 2**20
 _LARGEST_TORQUE = 32.0
 """Peak over rated torque that 0x6077 (16 bits, per mille) can still show."""
-_COUNT_KEYS: tuple[Key, ...] = (
-    (0x6065, 0),
-    (0x6067, 0),
-    (0x607F, 0),
-    (0x6080, 0),
-    (0x6081, 0),
-    (0x6083, 0),
-    (0x6084, 0),
-    (0x6085, 0),
-)
-"""Objects whose defaults go with the encoder's resolution."""
+_POSITION_KEYS: tuple[Key, ...] = ((0x6065, 0), (0x6067, 0))
+_VELOCITY_KEYS: tuple[Key, ...] = ((0x607F, 0), (0x6080, 0), (0x6081, 0))
+_ACCELERATION_KEYS: tuple[Key, ...] = ((0x6083, 0), (0x6084, 0), (0x6085, 0))
+"""Objects whose defaults go with the encoder's resolution and the drive's units."""
 
 
 @dataclass(frozen=True)
@@ -87,6 +83,10 @@ class SimulatedDrive:
     """Start values by name (``position_p`` ...), SI; factory values of the objects."""
     objects: Mapping[Key, Value] = field(default_factory=lambda: MappingProxyType({}))
     """Factory values of further objects by (index, sub-index), raw; they win over everything."""
+    torque_constant: float = 0.1
+    """N m/A (or N/A) of the motor, for drives that know currents."""
+    face: Face = REFERENCE
+    """What kind of drive it is."""
     store_time: float = 0.2
     """How long 0x1010 and 0x1011 take, s."""
 
@@ -123,7 +123,24 @@ class SimulatedDrive:
     @property
     def scales(self) -> Scales:
         """What the drive's units are in SI."""
-        return Scales(self.counts_per_unit, self.rated_torque)
+        return Scales(self.counts_per_unit, self.rated_torque, *self.face.units(self.motor))
+
+    @property
+    def motor(self) -> Motor:
+        """The motor as the drive's face knows it."""
+        return Motor(
+            self.rated_torque,
+            self.peak_torque,
+            self.torque_constant,
+            self.encoder_counts_per_rev,
+            self.counts_per_unit,
+            self.gains,
+        )
+
+    @property
+    def loops(self) -> Loops:
+        """How the drive's objects are its firmware's parameters."""
+        return self.face.loops(self.motor)
 
     @property
     def hardware(self) -> DriveHardware:
@@ -138,19 +155,25 @@ class SimulatedDrive:
     @property
     def factory_objects(self) -> dict[Key, Value]:
         """Factory values where this drive differs from the EDS file's defaults."""
-        scale = self.encoder_counts_per_rev / _STANDARD_RESOLUTION
+        counts = self.encoder_counts_per_rev / _STANDARD_RESOLUTION
+        velocity, acceleration = (
+            counts / self.counts_per_unit / unit for unit in self.face.units(self.motor)
+        )
         objects: dict[Key, Value] = {
             key: min(max(1, round(int(ENTRIES[key].default) * scale)), 2**32 - 1)
-            for key in _COUNT_KEYS
+            for keys, scale in (
+                (_POSITION_KEYS, counts),
+                (_VELOCITY_KEYS, velocity),
+                (_ACCELERATION_KEYS, acceleration),
+            )
+            for key in keys
         }
         objects |= {
             (0x1018, 4): self.serial,
             (0x6072, 0): round(1000 * self.peak_torque / self.rated_torque),
-            (0x6076, 0): round(1000 * self.rated_torque),
-            (0x608F, 1): self.encoder_counts_per_rev,
         }
         try:
-            objects |= gain_objects(dict(self.gains))
+            objects |= self.face.values(self.motor) | self.loops.factory()
         except ValueError as error:
             raise ValueError(f"simulated drive {self.name}: {error}") from None
         return objects | dict(self.objects)
@@ -237,6 +260,8 @@ def simulated_machine(profile: "MachineProfile") -> SimulatedMachine:
                 counts_per_metre=counts_per_metre,
                 serial=1000 + axis.node_id if serial is None else serial,
                 gains=truth.gains,
+                torque_constant=truth.torque_constant,
+                face=face_of(truth.face or _kind_of_drive(axis.drive, profile.path)),
             )
         )
     couplings = tuple(
@@ -244,6 +269,13 @@ def simulated_machine(profile: "MachineProfile") -> SimulatedMachine:
     )
     effects = tuple(_machine_effect(part, names) for part in simulation.effects)
     return SimulatedMachine(tuple(drives), couplings, simulation.seed, effects)
+
+
+def _kind_of_drive(name: str, beside: Path) -> str:
+    """Return the name of a drive profile, which may be given by its file."""
+    from drives.profile import load_drive
+
+    return load_drive(name, beside).name
 
 
 _PARTS: dict[str, type[ChainEffect]] = {

@@ -3,16 +3,11 @@
 from typing import Literal
 
 from drives.sim.dictionary import DriveDictionary, Key, Value
-from drives.sim.entries import ENTRIES
 
 SAVE = int.from_bytes(b"save", "little")
 LOAD = int.from_bytes(b"load", "little")
 
 _COMMUNICATION = range(0x1000, 0x2000)
-VOLATILE_KEYS = tuple(key for key, entry in ENTRIES.items() if entry.access == "rw")
-"""Everything that a power cycle sets back, to its stored value or to the factory's."""
-COMMUNICATION_KEYS = tuple(key for key in VOLATILE_KEYS if key[0] in _COMMUNICATION)
-"""The part of it that a reset of the communication sets back."""
 
 Bank = Literal["old", "new", "corrupted"]
 """What memory holds when the supply failed while it was written: drives with two banks hold what was
@@ -52,4 +47,7 @@ class NonVolatileMemory:
 
     def recall(self, dictionary: DriveDictionary, *, all_of_it: bool) -> None:
         """Fill working memory as after power-up; without ``all_of_it`` the communication part."""
-        dictionary.load(self._stored, VOLATILE_KEYS if all_of_it else COMMUNICATION_KEYS)
+        volatile = [key for key, entry in dictionary.entries.items() if entry.access == "rw"]
+        if not all_of_it:
+            volatile = [key for key in volatile if key[0] in _COMMUNICATION]
+        dictionary.load(self._stored, volatile)

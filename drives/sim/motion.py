@@ -83,6 +83,9 @@ class MotionControl:
     ) -> None:
         self._dictionary, self._emergency, self._scheduler = dictionary, emergency, scheduler
         self._axes, self._axis, self._scales = axes, axis, scales
+        self._velocity_units = scales.velocity_units
+        self.reset_blocked = False
+        """Whether a fault reset is ignored, as some drives do until the communication was reset."""
         self._set_points = SetPoints(self._begin_profile)
         self._stop: _Stop | None = None
         self._leaving = False
@@ -156,7 +159,7 @@ class MotionControl:
         """
         if not -_INT32 <= counts < _INT32:
             counts = (counts + _INT32) % (2 * _INT32) - _INT32
-        speed = int(velocity * self._scales.counts_per_unit)
+        speed = int(velocity * self._velocity_units)
         if not -_INT32 <= speed < _INT32:
             speed = _int32(speed)
         self.position_actual = counts
@@ -214,7 +217,7 @@ class MotionControl:
 
     def _write_offsets(self) -> None:
         cyclic = self.mode in (CYCLIC_POSITION, CYCLIC_VELOCITY, CYCLIC_TORQUE)
-        velocity = self._scales.position(self.velocity_offset) if cyclic else 0.0
+        velocity = self._scales.velocity(self.velocity_offset) if cyclic else 0.0
         torque = self._scales.torque(self.torque_offset) if cyclic else 0.0
         self._axes.set(self._axis, Parameter.VELOCITY_OFFSET, velocity)
         self._axes.set(self._axis, Parameter.TORQUE_OFFSET, torque)
@@ -227,7 +230,7 @@ class MotionControl:
         self._axes.follow_position(self._axis, scaled, self._steps)
 
     def _apply_velocity(self) -> None:
-        target = self._scales.position(self.target_velocity)
+        target = self._scales.velocity(self.target_velocity)
         if target == self._last_velocity:
             return
         before = self._last_velocity
@@ -276,14 +279,14 @@ class MotionControl:
         self._axes.follow_position(self._axis, self._axes.position(self._axis), 1)
 
     def _begin_profile(self, target: int) -> None:
-        read, scale = self._dictionary.read, self._scales.position
+        read, scales = self._dictionary.read, self._scales
         self._clamped = not self._low <= target <= self._high
         self._axes.follow_profile(
             self._axis,
-            scale(target),
-            scale(read(0x6081, 0)),
-            scale(read(0x6083, 0)),
-            scale(read(0x6084, 0)),
+            scales.position(target),
+            scales.velocity(read(0x6081, 0)),
+            scales.acceleration(read(0x6083, 0)),
+            scales.acceleration(read(0x6084, 0)),
         )
 
     def _profile_bits(self) -> int:
@@ -317,6 +320,8 @@ class MotionControl:
         if target is None:
             return
         match (self.state, target):
+            case (State.FAULT, _) if self.reset_blocked:
+                return
             case (State.FAULT, _):
                 self._emergency.clear()
                 self._fault_code = 0
@@ -424,7 +429,7 @@ class MotionControl:
         )
 
     def _begin_stop(self, *, quick: bool, done: Callable[[], None]) -> None:
-        ramp = self._scales.position(int(self._dictionary.read(0x6085 if quick else 0x6084, 0)))
+        ramp = self._scales.acceleration(int(self._dictionary.read(0x6085 if quick else 0x6084, 0)))
         speed = abs(self._axes.velocity(self._axis))
         longest = _STOP_MARGIN * speed / ramp + _STOP_EXTRA
         self._apply = None

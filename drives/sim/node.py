@@ -14,7 +14,6 @@ from durand.services.sdo.server import SDODomainAbort
 
 from drives.sim.abort_codes import Abort
 from drives.sim.dictionary import DriveDictionary, Key, Value
-from drives.sim.eds import packaged_eds
 from drives.sim.emergency import (
     HEARTBEAT_LOST,
     PDO_TOO_SHORT,
@@ -22,6 +21,8 @@ from drives.sim.emergency import (
     ErrorRegister,
     refuse_cob_id,
 )
+from drives.sim.faces import REFERENCE, Face
+from drives.sim.faces.face import Loops
 from drives.sim.firmware import SimulatedAxes
 from drives.sim.heartbeat import HeartbeatConsumers, HeartbeatProducer
 from drives.sim.memory import LOAD, SAVE, Bank, NonVolatileMemory
@@ -29,7 +30,7 @@ from drives.sim.motion import MotionControl
 from drives.sim.nmt import NetworkManagement
 from drives.sim.pdo import Getter, PdoService, Setter
 from drives.sim.port import BusPort
-from drives.sim.scales import FILTER_KEYS, GAINS, LIMIT_KEYS, Scales
+from drives.sim.scales import LIMIT_KEYS, Scales
 from drives.sim.scheduler import VirtualScheduler
 from drives.sim.sdo import DriveSdoServer
 
@@ -62,6 +63,10 @@ class DriveNode:
         Time that storing to non-volatile memory takes, s; the SDO answer comes after it.
     on_communication_change
         Called when the SYNC identifier, the cycle time or the NMT state changed.
+    loops
+        How its objects are the firmware's parameters.
+    face
+        What kind of drive it is.
     """
 
     def __init__(
@@ -76,7 +81,10 @@ class DriveNode:
         scheduler: VirtualScheduler,
         store_time: float,
         on_communication_change: Callable[[], None],
+        loops: Loops,
+        face: Face = REFERENCE,
     ) -> None:
+        self.face, self._loops = face, loops
         self.name, self.axis, self.store_time = name, axis, store_time
         self._first_node_id = node_id
         self.network, self._axes, self._scales = port, axes, scales
@@ -87,7 +95,9 @@ class DriveNode:
         """Fault injection: called when storing begins."""
         self._saving = False
         self.nmt = NetworkManagement(node_id, self._reset)
-        self.dictionary = dictionary = DriveDictionary(node_id, overrides)
+        self.dictionary = dictionary = DriveDictionary(
+            node_id, overrides, face.objects, face.hidden
+        )
         self.memory = NonVolatileMemory()
         self.emergency = EmergencyProducer(dictionary, self._send_emergency)
         self.motion = MotionControl(dictionary, self.emergency, axes, axis, scales, scheduler)
@@ -181,6 +191,7 @@ class DriveNode:
         if self.nmt.pending_node_id != self.nmt.node_id:
             self.nmt.node_id = self.nmt.pending_node_id
             self.dictionary.set_node_id(self.nmt.node_id)
+        self.motion.reset_blocked = False
         if not whole:
             self._connection_aborted()
             self.emergency.clear(PDO_TOO_SHORT)
@@ -199,8 +210,9 @@ class DriveNode:
         self.nmt.set_state(StateEnum.PRE_OPERATIONAL)
 
     def _apply_parameters(self) -> None:
-        for key in (*GAINS, *LIMIT_KEYS):
-            self._write_firmware(key, self.dictionary.read(*key))
+        self._loops_changed()
+        for key in LIMIT_KEYS:
+            self._write_limit(key, self.dictionary.read(*key))
         self._interpolation_changed()
         self.heartbeat.start(int(self.dictionary.read(0x1017, 0)))
         self._configure_consumers()
@@ -218,16 +230,23 @@ class DriveNode:
 
     def _connect_objects(self) -> None:
         dictionary = self.dictionary
-        eds = packaged_eds()
+        eds = self.face.eds
         dictionary.set_read_callback(0x1021, 0, lambda: eds)
         for key, getter in self._live_getters.items():
             dictionary.set_read_callback(*key, getter)
         for key, setter in self._setters.items():
             dictionary.effects[key] = partial(self._written, setter)
-        for key in (*GAINS, *LIMIT_KEYS):
-            dictionary.effects[key] = partial(self._write_firmware, key)
+        for key in self._loops.keys:
+            dictionary.effects[key] = lambda _: self._loops_changed()
+        for key in LIMIT_KEYS:
+            dictionary.effects[key] = partial(self._write_limit, key)
+        for key, bits in self.face.latches.items():
+            dictionary.effects[key] = partial(self._latched, key, bits)
+        for key in self.face.read_only:
+            dictionary.guards[key] = lambda _: Abort.READ_ONLY
+        self._connect_lock()
         dictionary.effects[0x6060, 0] = self.motion.set_mode
-        for key in FILTER_KEYS:
+        for key in self._loops.locked:
             dictionary.guards[key] = lambda _: Abort.WRONG_STATE if self.motion.powered else None
         dictionary.guards[0x1005, 0] = self._refuse_sync
         for key in ((0x1005, 0), (0x1006, 0)):
@@ -302,11 +321,32 @@ class DriveNode:
         except SDODomainAbort:
             return
 
-    def _write_firmware(self, key: Key, value: Any) -> None:
-        if key in GAINS:
-            parameter, scale = GAINS[key]
-            self._axes.set(self.axis, parameter, value * scale)
+    def _connect_lock(self) -> None:
+        lock = self.face.lock
+        if lock is None:
             return
+        dictionary = self.dictionary
+
+        def give(password: Value) -> None:
+            right = isinstance(password, bytes) and password.rstrip(b"\0") == lock.password
+            dictionary.force(*lock.level_key, int(right))
+
+        def closed(_value: Value) -> int | None:
+            return None if dictionary.read(*lock.level_key) else Abort.UNSUPPORTED_ACCESS
+
+        dictionary.effects[lock.password_key] = give
+        for key in lock.keys:
+            dictionary.guards[key] = closed
+
+    def _latched(self, key: Key, bits: int, value: int) -> None:
+        self.dictionary.force(*key, value & ~bits)
+
+    def _loops_changed(self) -> None:
+        for parameter, value in self._loops.settings(self.dictionary.read).items():
+            if self._axes.get(self.axis, parameter) != value:
+                self._axes.set(self.axis, parameter, value)
+
+    def _write_limit(self, key: Key, value: Any) -> None:
         if key in ((0x607F, 0), (0x6080, 0)):
             value = min(self.dictionary.read(0x607F, 0), self.dictionary.read(0x6080, 0))
         parameter, limit = self._scales.limit(key, value)
@@ -332,7 +372,10 @@ class DriveNode:
     def _heartbeat_lost(self, node_id: int) -> None:
         data = bytes((node_id,))
         option = int(self.dictionary.read(0x6007, 0))
-        if option == _FAULT:
+        if self.face.fault_after_lost_heartbeat and option:
+            self.motion.fault(HEARTBEAT_LOST, ErrorRegister.COMMUNICATION, data)
+            self.motion.reset_blocked = True
+        elif option == _FAULT:
             self.motion.fault(HEARTBEAT_LOST, ErrorRegister.COMMUNICATION, data)
         else:
             self.emergency.report(HEARTBEAT_LOST, ErrorRegister.COMMUNICATION, data)

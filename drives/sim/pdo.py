@@ -21,7 +21,7 @@ from durand.datatypes import is_numeric, struct_dict
 from drives.sim.abort_codes import Abort
 from drives.sim.dictionary import DriveDictionary, Key
 from drives.sim.emergency import PDO_TOO_SHORT, ErrorRegister, refuse_cob_id
-from drives.sim.entries import ENTRIES, MAPPING_ENTRIES, NOT_VALID, PDO_COUNT
+from drives.sim.entries import MAPPING_ENTRIES, NOT_VALID, PDO_COUNT, Entry
 
 LAST_SYNCHRONOUS = 240
 FIRST_EVENT = 254
@@ -59,28 +59,26 @@ class MappedObject:
         """Take ``index << 16 | subindex << 8 | bits`` apart."""
         return cls((word >> 16, word >> 8 & 0xFF), word & 0xFF)
 
-    def can_be_received(self) -> bool:
+    def can_be_received(self, dictionary: DriveDictionary) -> bool:
         """Whether an RPDO may carry it."""
         if self.key[1] == 0 and self.key[0] in _DUMMIES:
             return bool(self.bits == _DUMMIES[self.key[0]])
-        entry = ENTRIES.get(self.key)
-        return self._fits() and entry is not None and entry.access in ("rw", "wo")
+        entry = dictionary.shows(self.key)
+        return self._fits(entry) and entry is not None and entry.access in ("rw", "wo")
 
-    def can_be_sent(self) -> bool:
+    def can_be_sent(self, dictionary: DriveDictionary) -> bool:
         """Whether a TPDO may carry it."""
-        entry = ENTRIES.get(self.key)
-        return self._fits() and entry is not None and entry.access != "wo"
+        entry = dictionary.shows(self.key)
+        return self._fits(entry) and entry is not None and entry.access != "wo"
 
-    def _fits(self) -> bool:
-        entry = ENTRIES.get(self.key)
+    def _fits(self, entry: Entry | None) -> bool:
         if entry is None or not entry.mappable or not is_numeric(entry.type):
             return False
         return bool(struct_dict[entry.type].size * 8 == self.bits)
 
-    @property
-    def layout(self) -> str:
+    def layout(self, dictionary: DriveDictionary) -> str:
         """Its letter in a ``struct`` layout."""
-        entry = ENTRIES.get(self.key)
+        entry = dictionary.entries.get(self.key)
         type_ = entry.type if entry is not None else Type(self.key[0])
         return str(struct_dict[type_].format).lstrip("<")
 
@@ -134,6 +132,11 @@ class _Parameters:
         words = (int(self._dictionary.read(self._mapping, k)) for k in range(1, count + 1))
         return tuple(MappedObject.of(word) for word in words)
 
+    @property
+    def layout(self) -> str:
+        """The mapped values' ``struct`` layout."""
+        return "<" + "".join(each.layout(self._dictionary) for each in self.mapped)
+
     def _refuse_cob_id(self, value: int) -> int | None:
         return refuse_cob_id(value, self.read(1))
 
@@ -158,7 +161,9 @@ class _Parameters:
         return None
 
     def _allowed(self, mapped: MappedObject) -> bool:
-        return mapped.can_be_received() if self._receive else mapped.can_be_sent()
+        if self._receive:
+            return mapped.can_be_received(self._dictionary)
+        return mapped.can_be_sent(self._dictionary)
 
 
 def _refuse_transmission_type(value: int) -> int | None:
@@ -186,7 +191,7 @@ class ReceivePdo:
         on_short: Callable[[int], None],
     ) -> None:
         mapped = parameters.mapped
-        layout = struct.Struct("<" + "".join(each.layout for each in mapped))
+        layout = struct.Struct(parameters.layout)
         self._unpack, self.length = layout.unpack_from, layout.size
         self._setters = [
             _ignore if each.key[0] in _DUMMIES else image.setter(each.key) for each in mapped
@@ -222,7 +227,7 @@ class TransmitPdo:
         send: Callable[[int, bytes], None],
     ) -> None:
         mapped = parameters.mapped
-        self._pack = struct.Struct("<" + "".join(each.layout for each in mapped)).pack
+        self._pack = struct.Struct(parameters.layout).pack
         self.kind = parameters.transmission_type
         latched = self.kind <= LAST_SYNCHRONOUS
         self._getters = [image.getter(each.key, latched=latched) for each in mapped]

@@ -81,6 +81,8 @@ class RunningMachine:
             self.scheduler,
             drive.store_time,
             self._communication_changed,
+            drive.loops,
+            drive.face,
         )
 
     # -- who is there -----------------------------------------------------------------------------

@@ -54,6 +54,23 @@ class Scales:
     """Encoder counts per rad (or m)."""
     rated_torque: float
     """N m (or N)."""
+    velocity_unit: float = 0.0
+    """Rad/s (or m/s) per velocity unit; 0: counts/s."""
+    acceleration_unit: float = 0.0
+    """Rad/s2 (or m/s2) per acceleration unit; 0: counts/s2."""
+
+    def velocity(self, units: float) -> float:
+        """Rad/s (or m/s)."""
+        return units * self.velocity_unit if self.velocity_unit else self.position(units)
+
+    def acceleration(self, units: float) -> float:
+        """Rad/s2 (or m/s2)."""
+        return units * self.acceleration_unit if self.acceleration_unit else self.position(units)
+
+    @property
+    def velocity_units(self) -> float:
+        """Velocity units per rad/s (or m/s)."""
+        return 1 / self.velocity_unit if self.velocity_unit else self.counts_per_unit
 
     def position(self, counts: float) -> float:
         """Rad (or m); also rad/s of counts/s and so on."""
@@ -78,7 +95,7 @@ class Scales:
             case (0x607D, 2):
                 return Parameter.POSITION_MAX, self.position(value)
             case _:
-                return Parameter.MAX_VELOCITY, self.position(value)
+                return Parameter.MAX_VELOCITY, self.velocity(value)
 
 
 def gain_objects(gains: dict[str, float]) -> dict[Key, Value]:
