@@ -14,7 +14,7 @@ from drives.api import AxisLimits, DriveIdentity
 from drives.canopen_drive.conversion import Conversion, quantity_objects
 from drives.canopen_drive.line import Line, Node
 from drives.canopen_drive.scaling import Scaled, read_scaling
-from drives.cia402 import Mode, PowerState, emergency_text, in_words, modes_in
+from drives.cia402 import Mode, PowerState, emergency_text, in_words
 from drives.errors import (
     DriveFaultError,
     DrivesError,
@@ -31,6 +31,7 @@ from drives.errors import (
 from drives.objects import ObjectAddress, ObjectInfo
 from drives.profile import AxisProfile, DriveProfile
 from drives.profile.eds import info_at, read_eds, variables, writable
+from drives.profile.match import offered_modes
 from drives.units import AxisScaling
 
 logging.getLogger("canopen").setLevel(logging.CRITICAL)  # what goes wrong is raised, not logged
@@ -316,10 +317,12 @@ class CanopenDrive:
         SdoError
             If the drive does not let them be read.
         """
-        quantities = {
-            "counts_per_rev": self.scaled.counts_per_rev,
-            "rated_torque": self.scaled.rated_torque,
-        }
+        needed = {other for one in self.profile.parameters.values() for other in one.times}
+        quantities = {}
+        if "counts_per_rev" in needed:
+            quantities["counts_per_rev"] = self.scaled.counts_per_rev
+        if "rated_torque" in needed:
+            quantities["rated_torque"] = self.scaled.rated_torque
         for name, info, scale in quantity_objects(self.profile):
             quantities[name] = float(self.read(info)) * scale
         return Conversion(self.axis, self.profile, quantities, dict(self._unmet_conditions()))
@@ -424,7 +427,7 @@ class CanopenDrive:
             self.node.nmt.send_command(STOP_NODE)
 
     def check_mode(self, mode: Mode) -> None:
-        """Refuse a mode that 0x6502 does not offer.
+        """Refuse a mode that the drive does not have: by its 0x6502, else by its profile.
 
         Raises
         ------
@@ -432,11 +435,14 @@ class CanopenDrive:
             With the modes that are there.
         """
         supported = self.read_optional(objects.SUPPORTED_MODES)
-        if supported is not None and not supported & mode.supported_bit:
-            raise NotSupportedError(
-                f"{self.axis}: the drive has no mode {mode.words} ({mode.value}); 0x6502 is "
-                f"0x{supported:08X}: {in_words(modes_in(supported))}."
-            )
+        offered = offered_modes(self.profile, supported)
+        if offered is None or mode.value in offered:
+            return
+        source = "its profile" if supported is None else f"0x6502 is 0x{supported:08X}"
+        raise NotSupportedError(
+            f"{self.axis}: the drive has no mode {mode.words} ({mode.value}); {source}: "
+            f"{in_words(offered)}. This tool can not measure with it; nothing was moved."
+        )
 
     def set_mode(self, mode: Mode, timeout: float = 1.0) -> None:
         """Set the mode of operation and see it confirmed in 0x6061.

@@ -15,6 +15,7 @@ from drives.canopen_drive.interrupts import uninterrupted
 from drives.canopen_drive.line import Line
 from drives.canopen_drive.motion import CanopenMotion
 from drives.canopen_drive.pace import Punctuality, undisturbed
+from drives.canopen_drive.recovery import recover
 from drives.canopen_drive.torque_offset import why_not
 from drives.cia402 import Mode
 from drives.errors import DrivesError, LimitsError, NothingMovedError, NotSupportedError
@@ -276,6 +277,9 @@ def connect(
 ) -> Iterator[CanopenGroup]:
     """Open the machine's bus, and identify every drive on it; nothing moves and nothing is written.
 
+    But for one thing: a drive that is to move, and that is in the fault which a lost host leaves
+    behind, is led out of it as its profile says (``recovery``).
+
     Parameters
     ----------
     machine
@@ -315,11 +319,16 @@ def connect(
         for drive in drives:
             drive.identify()
         _check_alone(line, drives)
+        recovered = []
         for drive in drives if to_move else ():
+            drive.check_mode(Mode.CYCLIC_POSITION)
+            recovered.append(recover(drive))
             drive.check_idle()
             drive.read_scaling()
             drive.check_limits()
-        yield CanopenGroup(line, machine, drives, stop_requested)
+        group = CanopenGroup(line, machine, drives, stop_requested)
+        group.warnings += [said for said in recovered if said is not None]
+        yield group
 
 
 def _forget_nodes(line: Line) -> None:

@@ -157,6 +157,20 @@ class DriveProfile(Part):
         """Keys under which the profile says ``unknown``, dotted."""
         return unknown_keys(self)
 
+    @property
+    def tunable(self) -> frozenset[str]:
+        """Names of the parameters that a design for such a drive may have.
+
+        Of a drive whose gains this tool does not write they are those that a person can enter with
+        the maker's software.
+        """
+        if self.gains_via not in ("objects", "password"):
+            return frozenset(CASCADE_PARAMETERS)
+        known = {n for n, one in self.parameters.items() if one.factor != UNKNOWN}
+        if self.structure == "pid" and known.issuperset(PID_PARAMETERS):
+            known |= set(CASCADE_PARAMETERS)
+        return frozenset(known)
+
     def is_volatile(self, address: ObjectAddress) -> bool:
         """Whether an object is among ``volatile_commands``."""
         return not {address, ObjectAddress(address.index)}.isdisjoint(self.volatile_commands)

@@ -48,6 +48,10 @@ class LoopProfile(Part):
     """N m s/rad or N s/m."""
     velocity_i: NotNegative
     """N m/rad or N/m."""
+    velocity_ff: NotNegative = 0.0
+    """Share of the reference's velocity that is fed forward."""
+    inertia_ff: NotNegative = 0.0
+    """kg m2 or kg."""
 
 
 class AxisProfile(Part):

@@ -58,8 +58,16 @@ class Tuning:
     axes: tuple[AxisTuning, ...]
 
 
-def design(model: MachineModel) -> Tuning:
+def design(model: MachineModel, tunable: Mapping[str, frozenset[str]] | None = None) -> Tuning:
     """Return parameters for every axis of an identified machine.
+
+    Parameters
+    ----------
+    model
+        The machine.
+    tunable
+        Names of the parameters that each axis' drive has; an axis that is not named has all.  A
+        notch is designed only where there is a filter for it.
 
     Raises
     ------
@@ -67,10 +75,15 @@ def design(model: MachineModel) -> Tuning:
         If the model is no machine, the loops are not stable, or the margin can not be kept.
     """
     _check_masses(model)
+
+    def has(axis: str, parameter: str) -> bool:
+        return tunable is None or axis not in tunable or parameter in tunable[axis]
+
     loops = [_rule(axis) for axis in model.axes]
     loops = _within_bound(model, loops)
-    for k in range(len(loops)):
-        loops = _with_notch(model, loops, k)
+    for k, axis in enumerate(model.axes):
+        if has(axis.name, "filter1_type"):
+            loops = _with_notch(model, loops, k)
     closed = ClosedLoop(model, tuple(loops))
     if not closed.stable:
         raise DesignError(
@@ -81,7 +94,7 @@ def design(model: MachineModel) -> Tuning:
         tuple(
             AxisTuning(
                 axis.name,
-                as_parameters(loop),
+                {n: v for n, v in as_parameters(loop).items() if has(axis.name, n)},
                 sensitivity_peak(model, loops, k),
                 _reason(axis, loop),
             )

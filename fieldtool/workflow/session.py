@@ -233,7 +233,7 @@ def open_session(
 def _resolved(profile: MachineProfile) -> dict[str, Any]:
     """Return the profile as its file has it, with drive profiles found from the folder too.
 
-    The bus is the one that is used, which may be another one than the file's.
+    The bus is the one that is used, which may be another one than the file's.  Passwords stay out.
     """
     data: dict[str, Any] = yaml.safe_load(profile.path.read_text(encoding="utf-8"))
     data["bus"] = profile.bus.as_dict()
@@ -241,6 +241,9 @@ def _resolved(profile: MachineProfile) -> dict[str, Any]:
         beside = profile.path.parent / str(axis["drive"])
         if beside.is_file():
             axis["drive"] = str(beside.resolve())
+        if axis.get("eds"):
+            axis["eds"] = str((profile.path.parent / str(axis["eds"])).resolve())
+        axis.pop("password", None)
     return data
 
 

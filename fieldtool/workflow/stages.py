@@ -7,7 +7,8 @@ from pathlib import Path
 
 from drives.bus import not_imitated
 from drives.canopen_drive import CanopenGroup, connect
-from drives.errors import UserStopError
+from drives.canopen_drive.group import profile_of
+from drives.errors import NotSupportedError, UserStopError
 from drives.parameters import Change
 from drives.profile import MachineProfile, load_machine
 from fieldtool.design.tuning import Tuning, design
@@ -90,7 +91,7 @@ def run(
         identified = _identify(session, options)
         session.screen.found(identified.model, truth_model(session.machine))
         session.screen.stage("Design new controller parameters")
-        tuning = _design(session.folder, identified.model)
+        tuning = _design(session.folder, session.machine, identified.model)
         session.screen.designed(tuning)
         if stop_requested():
             raise UserStopError(
@@ -195,7 +196,7 @@ def redesign(folder_path: Path) -> Tuning:
         If there is no model.
     """
     folder = SessionFolder(folder_path)
-    return _design(folder, read_model(folder.model))
+    return _design(folder, load_machine(folder.machine), read_model(folder.model))
 
 
 def write(
@@ -349,9 +350,10 @@ def check_known(model: MachineModel) -> None:
                     )
 
 
-def _design(folder: SessionFolder, model: MachineModel) -> Tuning:
+def _design(folder: SessionFolder, machine: MachineProfile, model: MachineModel) -> Tuning:
     check_known(model)
-    tuning = design(model)
+    tunable = {axis.name: profile_of(axis, machine).tunable for axis in machine.axes}
+    tuning = design(model, tunable)
     write_yaml(folder.tuning, tuning_as_dict(tuning))
     return tuning
 
@@ -365,7 +367,11 @@ def _write(
 ) -> WriteBack | None:
     folder = session.folder
     if not options.write:
-        changes = changes_for(group.drives, tuning)
+        try:
+            changes = changes_for(group.drives, tuning)
+        except NotSupportedError as error:  # a drive whose gains are for its maker's software
+            session.warn(str(error))
+            changes = ()
         return WriteBack((), changes, in_memory=False, stored=False, backup=None)
     session.screen.stage("Write the new parameters, and read them back")
     result = apply(

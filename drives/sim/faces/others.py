@@ -27,9 +27,14 @@ def _standard_motor(motor: Motor) -> dict[Key, Value]:
     return {(0x6076, 0): round(1000 * motor.rated_torque), (0x608F, 1): motor.counts_per_rev}
 
 
+def _torque_alone(motor: Motor) -> dict[Key, Value]:
+    """Nobody entered the encoder: 0x608F and 0x6092 stay 1/1, positions are counts."""
+    return {(0x6076, 0): round(1000 * motor.rated_torque)}
+
+
 def _elmo_gold() -> Face:
     objects, hidden = dressed(shipped("elmo-gold.dcf"))
-    return Face("elmo-gold", FixedLoops, with_modes(objects), hidden, values=_standard_motor)
+    return Face("elmo-gold", FixedLoops, with_modes(objects), hidden, values=_torque_alone)
 
 
 def _elmo_simpliq() -> Face:

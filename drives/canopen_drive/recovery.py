@@ -1,0 +1,49 @@
+"""Lead a drive out of the fault that a lost host leaves behind; other faults are a person's."""
+
+from drives import objects
+from drives.canopen_drive.drive import CanopenDrive
+from drives.cia402 import Controlword, PowerState
+from drives.errors import DriveFaultError
+from drives.objects import ObjectAddress, ObjectInfo
+
+HOST_LOST = (0x8130, 0x8120)
+"""Emergency codes: heartbeat (or life guarding) lost, CAN in error passive mode.  CiA 301."""
+RESET_COMMUNICATION = 0x82
+BOOT_TIME, RESET_TIME = 5.0, 1.0
+"""Seconds that a node may take to boot, and a drive to leave its fault."""
+_NEWEST = ObjectInfo(ObjectAddress(0x1003, 1), "UNSIGNED32", "standard error field")
+
+
+def recover(drive: CanopenDrive) -> str | None:
+    """End the fault of a drive that lost its host, as its profile says; return what was done.
+
+    None if the drive is in no fault, in another one, or its profile does not know the way: then
+    nothing was sent.  Nothing moves: the power stage stays off.
+
+    Raises
+    ------
+    DriveFaultError
+        If the drive stays in the fault.
+    """
+    how = drive.profile.recovery
+    if how == "unknown" or drive.power_state() is not PowerState.FAULT:
+        return None
+    code = (drive.read_optional(_NEWEST) or 0) & 0xFFFF
+    if code not in HOST_LOST:
+        return None
+    if how == "communication reset":
+        drive.node.nmt.send_command(RESET_COMMUNICATION)
+        drive.line.wait(BOOT_TIME, drive.answers)
+    drive.write(objects.CONTROLWORD, Controlword.DISABLE_VOLTAGE)
+    drive.write(objects.CONTROLWORD, Controlword.FAULT_RESET)  # its rising edge counts
+    left = drive.line.wait(RESET_TIME, lambda: drive.power_state() is not PowerState.FAULT)
+    drive.write(objects.CONTROLWORD, Controlword.DISABLE_VOLTAGE)
+    if not left:
+        raise DriveFaultError(
+            f"{drive.axis}: the drive stays in the fault 0x{code:04X} (it lost its host) after a {how}. "
+            "Switch it off and on."
+        )
+    return (
+        f"{drive.axis}: was in fault 0x{code:04X} because it lost its host: an earlier session ended "
+        f"without a word. The fault was reset ({how})."
+    )
