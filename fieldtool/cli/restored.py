@@ -8,7 +8,7 @@ from drives.parameters import DriveOutcome, Memory
 from fieldtool.writeback.restoring import Restored
 
 MEMORY_WORDS = {
-    Memory.UNTOUCHED: "as it was, not written",
+    Memory.UNTOUCHED: "as it was before",
     Memory.OLD: "old values, stored",
     Memory.NEW: "new values: a power cycle brings them",
     Memory.UNKNOWN: "not known",
@@ -48,19 +48,18 @@ def sentences(restored: Restored) -> list[str]:
         "1 parameter differed and was" if count == 1 else f"{count} parameters differed and were"
     )
     said.append(f"{differed} restored; all were read back.")
-    memories = {outcome.memory for outcome in restored.outcomes}
-    if memories == {Memory.OLD}:
+    not_stored = [o.axis for o in restored.outcomes if o.memory is not Memory.OLD]
+    if not not_stored:
         said.append("They are stored too: they survive a power cycle.")
-    elif Memory.NEW in memories:
+    elif len(not_stored) == len(restored.outcomes):
         said.append(
             "They are in the drives' working memory only: a power cycle brings back what was stored. "
             "Use --store to keep them."
         )
     else:
         said.append(
-            "They are in the drives' working memory only, where it does not say stored: a power cycle "
-            "brings back what those drives held in their non-volatile memory before. Use --store to "
-            "keep them."
+            f"{', '.join(not_stored)}: in working memory only, because nothing new was stored there; a "
+            "power cycle brings back what was stored before the write. Use --store to keep them."
         )
     return [*said, *restored.notes]
 
