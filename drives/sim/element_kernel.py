@@ -77,8 +77,9 @@ def _gap(p, memory, twist, velocity):  # type: ignore[no-untyped-def]
         return -linear
     closing = velocity if twist > 0.0 else -velocity
     if memory[0] == 0.0:
-        memory[0], memory[1] = 1.0, max(closing, 1e-9)
-    lost = p[3] * closing / memory[1]
+        memory[0], memory[1] = 1.0, 1e-9
+    memory[1] = max(memory[1], closing)
+    lost = p[3] * closing / memory[1] * p[0] / (p[0] + depth)
     contact = p[1] * depth * max(1.0 + lost, 0.0) + p[2] * closing
     return np.copysign(max(contact, 0.0), twist) - linear
 

@@ -125,9 +125,9 @@ def test_within_its_play_a_joint_transmits_nothing() -> None:
 
 def test_an_impact_gives_back_what_restitution_says(fresh_rng: np.random.Generator) -> None:
     for e in (0.95, 0.8, 0.5):
-        speed = fresh_rng.uniform(0.2, 2.0)
+        speed = fresh_rng.uniform(0.005, 0.05)
         chain = replace(two_mass(Backlash(0.02, restitution=e), damper=0.0), viscous_friction=0.0)
-        states = released(chain, np.array([0.0, 0.0, 0.0, speed]), 1200)
+        states = released(chain, np.array([0.0, 0.00999, 0.0, speed]), 1200)
         relative = states[:, 3] - states[:, 2]
         after = relative[np.argmax(relative < 0.0) :]
         twist = states[:, 1] - states[:, 0]

@@ -27,9 +27,11 @@ def _masses(effect: str, joint: int, site: Site) -> tuple[int, int]:
 class Backlash:
     """Free play with elastic contact that loses energy; model name backlash.
 
-    Within the play nothing is transmitted.  In contact, with the penetration p = abs(d) - play / 2,
-    f = k p (1 + u p' / p'_impact), never pulling.  What u gives back the share e of the velocity of
-    two free masses follows from u (1 + e) = ln((1 + u) / (1 - u e)).
+    Within the play nothing is transmitted.  In contact, with half the play g and the penetration
+    p = abs(d) - g, f = k p (1 + u p' / v g / (g + p)) + c p', never pulling; v is the largest p' of this
+    contact.  The loss is one of the impact: deep in contact, and without play, the joint is its spring
+    and damper.  What u gives back the share e of the velocity of two free masses follows, where p stays
+    well below g, from u (1 + e) = ln((1 + u) / (1 - u e)).
     Source: Gonthier, McPhee, Lange, Piedboeuf, Multibody System Dynamics 11, 2004, p. 209.
 
     Raises
@@ -42,7 +44,7 @@ class Backlash:
     """From contact to contact, rad or m, above 0."""
     joint: int = 1
     restitution: float = 0.6
-    """Velocity after an impact over that before, 0.1 to 1."""
+    """Velocity after a light impact over that before, 0.1 to 1."""
 
     def __post_init__(self) -> None:
         check_number("backlash", "play", self.play, "rad (m)", 1e-12)

@@ -22,7 +22,7 @@ class ElementKind(IntEnum):
     stiffness, bristle damping.  Memory: bristle deflection."""
     GAP = 1
     """Half gap, spring and damper that the matrices have, share of the contact force that an impact's
-    closing velocity adds.  Memory: in contact, velocity at impact."""
+    closing velocity adds.  Memory: in contact, largest closing velocity of this contact."""
     HARDENING = 2
     """Spring in the matrices, stretch."""
     SOFTENING = 3
