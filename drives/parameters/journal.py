@@ -156,6 +156,11 @@ class Journal:
         """Whether drives may hold old and new values mixed."""
         return self.state is State.OPEN
 
+    @property
+    def writes(self) -> bool:
+        """Whether it is about new values; without, drives only held others for a time."""
+        return any(record.entries for record in self.drives)
+
     def began(self, step: Step) -> "Journal":
         """Return the journal to be saved before a step is done."""
         if step.action is Action.STORE:

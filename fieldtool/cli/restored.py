@@ -41,8 +41,9 @@ def sentences(restored: Restored) -> list[str]:
     said = []
     if restored.cut_off is not None:
         said.append(
-            f"The write that began at {restored.cut_off.begun} had been cut off. It was taken back: all "
-            "drives hold the old values."
+            f"The {'write' if restored.had_write else 'measurement'} that began at "
+            f"{restored.cut_off.begun} had been cut off. It was taken back: all drives hold the old "
+            "values."
         )
     differed = (
         "1 parameter differed and was" if count == 1 else f"{count} parameters differed and were"

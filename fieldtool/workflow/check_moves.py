@@ -1,6 +1,7 @@
 """Check a machine by tiny moves; whatever happens, all axes are off afterwards, and all is put back."""
 
 from collections.abc import Callable
+from pathlib import Path
 
 from drives.bus import Bus, clock_of
 from drives.bus.clock import WallClock
@@ -18,7 +19,10 @@ from fieldtool.workflow.fast_measuring import planned_before
 from fieldtool.workflow.models import prior_model
 from fieldtool.workflow.planning import timing, usual_seconds
 from fieldtool.workflow.preparation import axes_of, setting_of
+from fieldtool.writeback.unfinished import refuse_unfinished
 
+SESSION = Path("sessions") / "check"
+"""Beside it a write that was cut off is looked for; nothing is put there."""
 ROOM = "room for the sweeps"
 MOVE_CHECKS = (ROOM, "direction", "brake and friction", "load at rest")
 """Names of what is checked by moving."""
@@ -63,6 +67,7 @@ class MoveChecks:
         """
         try:
             with connect(self._machine, bus, stop_requested) as group:
+                refuse_unfinished(self._machine.name, group.drives, SESSION)
                 try:
                     self._plan_and_move(group)
                 finally:

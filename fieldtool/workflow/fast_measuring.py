@@ -34,7 +34,7 @@ from fieldtool.workflow.planning import (
 from fieldtool.workflow.preparation import axes_of, recording_header, setting_of
 from fieldtool.workflow.session import Options, Screen, Session
 from fieldtool.workflow.stopped import check_loops, judge_stop
-from fieldtool.writeback.backups import take_backup
+from fieldtool.writeback.temporary import backed_up
 
 GUESSED_NOISE = 1e-3
 """Of the rated torque: noise of the torque before the pilot has measured it (one count of 0x6077)."""
@@ -50,8 +50,8 @@ SEED = 20
 
 def measured_fast(session: Session, group: CanopenGroup, options: Options) -> float:
     """Back the parameters up, run pilot and main experiments, and return the seconds of excitation."""
-    take_backup(session.machine.name, group.drives, session.folder.parameters_before)
-    with group.without_feed_forward():
+    before = session.folder.parameters_before
+    with backed_up(session.machine.name, group.drives, before), group.without_feed_forward():
         return _Measurement(session, group, options).run()
 
 

@@ -23,7 +23,7 @@ from fieldtool.records.recording import Experiment, Recording, RecordingWriter
 from fieldtool.workflow.models import prior_model
 from fieldtool.workflow.preparation import axes_of, recording_header, setting_of
 from fieldtool.workflow.session import Session
-from fieldtool.writeback.backups import take_backup
+from fieldtool.writeback.temporary import backed_up
 
 SETTLE_PERIODS = 17.0
 """Periods of the lowest mode that a tone takes to settle, for the estimate of a plan's duration."""
@@ -32,8 +32,8 @@ SETTLE_PERIODS = 17.0
 def measured(session: Session, group: CanopenGroup) -> float:
     """Back the parameters up, measure both passes, and return the seconds of excitation."""
     machine, folder = session.machine, session.folder
-    take_backup(machine.name, group.drives, folder.parameters_before)
-    with group.without_feed_forward():
+    before = folder.parameters_before
+    with backed_up(machine.name, group.drives, before), group.without_feed_forward():
         return _measure_both_passes(session, group)
 
 

@@ -199,7 +199,7 @@ def bring_back(
         source.backup_path,
         before if before is not None and before.is_open else None,
         tuple(transaction.outcomes.values()),
-        had_write=any(record.entries for record in journal.drives),
+        had_write=journal.writes,
         notes=tuple(notes),
     )
 

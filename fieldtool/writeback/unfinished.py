@@ -10,6 +10,7 @@ import os
 import re
 import sys
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from itertools import islice
 from pathlib import Path
 
@@ -59,6 +60,16 @@ class JournalKeeper:
             self._note(journal)
             self._noted = True
         elif not journal.is_open:
+            for record in journal.drives:
+                remove_durably(_note_of(journal.machine, record))
+
+    def forget(self, journal: Journal) -> None:
+        """Remove journal and notes, because nothing is left to be taken back.
+
+        What can not be removed does no harm: there will be nothing to restore.
+        """
+        with suppress(OSError):
+            remove_durably(self.path)
             for record in journal.drives:
                 remove_durably(_note_of(journal.machine, record))
 
@@ -121,20 +132,27 @@ def refuse_unfinished(machine: str, drives: Sequence[ParameterDrive], session: P
         note = _note_of(machine, one)
         if note.exists():
             folder = _folder_of(note)
-            if _is_open(folder / JOURNAL, note):
-                raise _refusal(folder, one.axis)
+            journal = _journal(folder / JOURNAL, note)
+            if journal.is_open:
+                raise _refusal(folder, one.axis, journal)
             remove_durably(note)
     for journal_file in (session / JOURNAL, *_neighbours(session)):
         if journal_file.is_file() and _may_be_open(journal_file):
-            axis = _same_drive(journal_file, recorded, own=journal_file.parent == session)
-            if axis is not None:
-                raise _refusal(journal_file.parent, axis)
+            own = journal_file.parent == session
+            found = _open_journal(journal_file, own=own)
+            axis = None if found is None else _same_drive(found, recorded, own=own)
+            if found is not None and axis is not None:
+                raise _refusal(journal_file.parent, axis, found)
 
 
-def _refusal(folder: Path, axis: str) -> UnfinishedWriteError:
+def _refusal(folder: Path, axis: str, journal: Journal) -> UnfinishedWriteError:
+    what = (
+        "a write of parameters was cut off, and the drives may hold old and new ones mixed"
+        if journal.writes
+        else "a measurement was cut off, and the drives may hold what it had set for its time"
+    )
     return UnfinishedWriteError(
-        f"{axis}: a write of parameters was cut off, and the drives may hold old and new ones mixed. "
-        f"Take it back first: fieldtool restore {folder}. Nothing was moved or written."
+        f"{axis}: {what}. Take it back first: fieldtool restore {folder}. Nothing was moved or written."
     )
 
 
@@ -172,12 +190,12 @@ def _folder_of(note: Path) -> Path:
     return Path(data["session"])
 
 
-def _is_open(journal_file: Path, note: Path) -> bool:
+def _journal(journal_file: Path, note: Path) -> Journal:
     try:
-        return load_journal(journal_file).is_open
+        return load_journal(journal_file)
     except ProfileError as error:
         raise UnfinishedWriteError(
-            f"a write of parameters into these drives was cut off, and its journal is not to be had: "
+            f"something that had changed these drives was cut off, and its journal is not to be had: "
             f"{error}. If the folder was moved, use `fieldtool restore` with where it is now; if the "
             f"drives were brought in order elsewhere, delete {note}. Nothing was moved or written."
         ) from error
@@ -204,16 +222,18 @@ def _may_be_open(journal_file: Path) -> bool:
         return False
 
 
-def _same_drive(journal_file: Path, drives: Iterable[_Identified], *, own: bool) -> str | None:
-    """Return the axis of one of these drives that an open journal holds."""
+def _open_journal(journal_file: Path, *, own: bool) -> Journal | None:
     try:
         journal = load_journal(journal_file)
     except ProfileError:
         if own:
             raise
         return None
-    if not journal.is_open:
-        return None
+    return journal if journal.is_open else None
+
+
+def _same_drive(journal: Journal, drives: Iterable[_Identified], *, own: bool) -> str | None:
+    """Return the axis of one of these drives that a journal holds."""
     for drive in drives:
         for record in journal.drives:
             known = (record.vendor_id, record.product_code, record.serial_number)

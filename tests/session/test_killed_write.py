@@ -45,3 +45,38 @@ def test_the_check_would_see_a_mixed_machine(machine, fresh_rng: np.random.Gener
     assert working[12][0x2010, 1] == round(moment.old["position_p"] * 1000)
     machine.bus.on_frame = lambda _: None
     assert machine.run("restore", session).code == 0
+
+
+def test_a_killed_measurement_leaves_a_note_and_is_taken_back(machine):
+    """Feed-forward is off while it runs: no later backup may take that for the machine's own."""
+    machine.ask(lambda: [node.dictionary.write(0x2010, 4, 900) for node in machine.nodes])
+    before = machine.working()
+    syncs = []
+
+    def kill_in_motion(message):
+        if message.arbitration_id == 0x80:
+            syncs.append(message)
+            if len(syncs) == 200:
+                tool.kill()
+
+    machine.bus.on_frame = kill_in_motion
+    session = machine.folder / "measured"
+    tool = machine.start("measure", machine.profile, "--yes", "--out", session)
+    assert tool.wait().code == -9
+    machine.bus.on_frame = lambda _: None
+    assert machine.working()[11][0x2010, 4] == 0
+    assert (session / "parameters-before.yaml").is_file()
+    machine.ask(lambda: machine.machine.advance_to(machine.machine.time + 1_000_000_000))
+    for node in machine.nodes:
+        assert not node.motion.powered, "stopped by its own heartbeat consumer"
+        machine.ask(lambda node=node: node.motion.write_controlword(0x80))
+    looked = machine.run("measure", machine.profile, "--yes", "--out", machine.folder / "next")
+    assert looked.code == 3
+    assert "a measurement was cut off" in looked.text
+    restored = machine.run("restore", session)
+    assert restored.code == 0, restored.text
+    assert "The measurement that began at" in restored.text
+    after = machine.working()
+    for node in machine.nodes:
+        for key in ((0x2010, 4), (0x6007, 0), (0x1016, 1), (0x1029, 1), (0x60C2, 1)):
+            assert after[node.node_id][key] == before[node.node_id][key], key

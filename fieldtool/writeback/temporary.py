@@ -1,0 +1,40 @@
+"""Note that drives hold other values for the time of a measurement, should it be cut off."""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+from drives.canopen_drive import CanopenDrive
+from drives.parameters import Storing
+from drives.parameters.journal import Goal
+from fieldtool.writeback.backups import take_backup
+from fieldtool.writeback.transaction import planned_journal
+from fieldtool.writeback.unfinished import JOURNAL, JournalKeeper, not_kept
+
+
+@contextmanager
+def backed_up(machine: str, drives: Sequence[CanopenDrive], backup_path: Path) -> Iterator[None]:
+    """Back all parameters up, and leave a note for as long as the drives may hold others.
+
+    A measurement switches feed-forward off and arms fail-safe objects, and puts them back when it
+    ends, however it ends.  If the tool is killed it can not; then the note makes the next session
+    ask for ``fieldtool restore``, so that no later backup takes such values for the machine's own.
+
+    Raises
+    ------
+    OutputError
+        If backup or note can not be written; nothing was changed.
+    """
+    backup = take_backup(machine, drives, backup_path)
+    keeper = JournalKeeper(backup.with_name(JOURNAL))
+    journal = planned_journal(machine, drives, (), backup.name, Storing.NONE)
+    journal = replace(journal, goal=Goal.OLD).turned_back(distrust=True)
+    try:
+        keeper(journal)
+    except OSError as error:
+        raise not_kept(keeper, error) from error
+    try:
+        yield
+    finally:
+        keeper.forget(journal)
