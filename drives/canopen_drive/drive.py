@@ -167,6 +167,18 @@ class CanopenDrive:
             )
         return value
 
+    def read_number(self, info: ObjectInfo) -> int | float:
+        """Read an object that holds a number, whole or not."""
+        value = self.read(info)
+        if isinstance(value, str):
+            raise SdoError(
+                self.axis,
+                info.address.index,
+                info.address.subindex,
+                f"holds text {value!r}, a number was expected.",
+            )
+        return value
+
     def read_optional(self, info: ObjectInfo) -> int | None:
         """Read an object that some drives lack; None if this one does."""
         try:

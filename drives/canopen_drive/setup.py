@@ -36,24 +36,24 @@ class TemporaryObjects:
 
     def __init__(self, drive: CanopenDrive) -> None:
         self._drive = drive
-        self._before: list[tuple[ObjectInfo, int, bool]] = []
+        self._before: list[tuple[ObjectInfo, float, bool]] = []
 
-    def change(self, info: ObjectInfo, value: int, before: int | None = None) -> None:
+    def change(self, info: ObjectInfo, value: float, before: float | None = None) -> None:
         """Write a value, remembering the one before (read now, unless given)."""
         if before is None:
-            before = self._drive.read_int(info)
+            before = self._drive.read_number(info)
         if before == value:
             return
         self.note(info, before)
         self._drive.write(info, value)
-        found = self._drive.read_int(info)
+        found = self._drive.read_number(info)
         if found != value:
             raise NotSupportedError(
                 f"{self._drive.axis}, object {info.address} ({info.name}): wrote {value}, the drive "
                 f"holds {found}. It can not be used safely."
             )
 
-    def note(self, info: ObjectInfo, before: int, matters: bool = True) -> None:
+    def note(self, info: ObjectInfo, before: float, matters: bool = True) -> None:
         """Remember a value to be written when all is put back.
 
         What does not matter, such as a mapping entry that is not in use, may be refused then.

@@ -5,6 +5,7 @@ durand's own EDS writer is not used: it swaps the codes of arrays and records, a
 object above 0x2000 mappable.
 """
 
+from collections.abc import Sequence
 from importlib.resources import files
 
 from durand.datatypes import DatatypeEnum as Type
@@ -31,11 +32,14 @@ def packaged_eds() -> bytes:
     return files("profiles").joinpath("drives", EDS_FILE).read_bytes()
 
 
-def eds_text() -> str:
-    """Return the data sheet of the simulated drive as it stands in its tables."""
-    mandatory = [o for o in OBJECTS if o.index in _MANDATORY]
-    maker = [o for o in OBJECTS if 0x2000 <= o.index < 0x6000]
-    optional = [o for o in OBJECTS if o not in mandatory and o not in maker]
+def eds_text(
+    described: Sequence[ObjectEntry] = OBJECTS,
+    comment: str = "Positions in encoder counts, torques in per mille.",
+) -> str:
+    """Return the data sheet of a simulated drive, the reference drive's unless others are given."""
+    mandatory = [o for o in described if o.index in _MANDATORY]
+    maker = [o for o in described if 0x2000 <= o.index < 0x6000]
+    optional = [o for o in described if o not in mandatory and o not in maker]
     parts = [
         _section(
             "FileInfo",
@@ -67,7 +71,7 @@ def eds_text() -> str:
             LSS_Supported=1,
         ),
         _section("DummyUsage", **{f"Dummy{k:04d}": int(k >= 2) for k in range(1, 8)}),
-        _section("Comments", Lines=1, Line1="Positions in encoder counts, torques in per mille."),
+        _section("Comments", Lines=1, Line1=comment),
     ]
     for name, objects in (
         ("MandatoryObjects", mandatory),

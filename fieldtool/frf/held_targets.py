@@ -12,7 +12,11 @@ has to be taken off the sampled phasor.  At T = 4 ms and 8 Hz it is 0.2 % of the
 and reference; masses and springs come out 0.13 % too large without it.
 
 Valid for: T short against the velocity loop's response (velocity_p T well below the motor's mass),
-feed-forward off, no low-pass near the SYNC rate, d below T.
+no low-pass near the SYNC rate, d below T.
+
+A drive that can not be kept from feeding the reference's velocity forward, as one whose loop is a PID
+with D on the error, adds velocity_p times a staircase: the slope of the straight line from target to
+target.  That is a torque held from SYNC to SYNC.
 
 Torque offsets are held from SYNC to SYNC; see :func:`held_offset`.
 """
@@ -24,7 +28,8 @@ from fieldtool.records.recorded import Experiment, Recording, Segment
 
 LINEAR_TARGETS = "linear_targets"
 """Key of a recording's source: ``AXIS=LAG`` of the axes whose drives interpolate linearly, LAG the
-torque's lag in s, with blanks between."""
+torque's lag in s, with blanks between; ``AXIS=LAG/SHARE`` where the drive feeds that share of the
+reference's velocity forward."""
 
 
 def folded_torque(
@@ -78,6 +83,12 @@ def folded_phasors(
         reached = reference[:, axis] * np.exp(-1j * omega * period)
         lost = (omega * period) ** 2 * _lost(lag, period)
         folded[:, axis] = controller.velocity_p * controller.position_p * reached * lost
+        share = shares(recording)[information.name]
+        if share:
+            slope = reference[:, axis] * (1 - np.exp(-1j * omega * period)) / period
+            stair = (share * controller.velocity_p * slope)[:, None]
+            sampled = period - min(lag, period)
+            folded[:, axis] -= held_offset(frequencies, stair, period, sampled)[:, 0]
     return folded
 
 
@@ -96,6 +107,9 @@ def folded_course(recording: Recording, experiment: Experiment) -> FloatArray:
         if lag is None or controller is None or np.any(np.isnan(reference[:, axis])):
             continue
         gain = controller.velocity_p * controller.position_p * _lost(lag, period)
+        # a stair's value is that of its middle, and is sampled (T - lag) after its begin
+        late = shares(recording)[information.name] * (min(lag, period) / period - 0.5)
+        gain -= controller.velocity_p / period * late
         folded[2:, axis] = -gain * np.diff(reference[:, axis], 2)
     return folded
 
@@ -157,6 +171,15 @@ def lags(recording: Recording) -> dict[str, float]:
     """Return the torque's lag, s, of the axes whose drives interpolate linearly, by name."""
     found = {}
     for item in str(recording.source.get(LINEAR_TARGETS, "")).split():
-        name, _, lag = item.rpartition("=")
-        found[name] = float(lag)
+        name, _, numbers = item.rpartition("=")
+        found[name] = float(numbers.partition("/")[0])
+    return found
+
+
+def shares(recording: Recording) -> dict[str, float]:
+    """Return the share of the reference's velocity that those drives feed forward, by name."""
+    found = {}
+    for item in str(recording.source.get(LINEAR_TARGETS, "")).split():
+        name, _, numbers = item.rpartition("=")
+        found[name] = float(numbers.partition("/")[2] or 0.0)
     return found

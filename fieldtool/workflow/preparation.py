@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from drives.canopen_drive import CanopenGroup
+from drives.canopen_drive import CanopenDrive, CanopenGroup
 from drives.parameters import read_loop
 from drives.profile import MachineProfile
 from fieldtool.experiment.axes import Axes
@@ -55,7 +55,7 @@ def recording_header(
         )
     source = {"machine": machine.name}
     linear = [
-        f"{d.axis}={d.profile.torque_lag!r}"
+        _linear_targets(d)
         for d in group.drives
         if d.profile.interpolation == "linear"
         and not smooth(loop_from_parameters(read_loop(d)), 2 * np.pi / cycle_time)
@@ -63,6 +63,15 @@ def recording_header(
     if linear:
         source[LINEAR_TARGETS] = " ".join(linear)
     return Recording(cycle_time, tuple(axes), (), machine.description, source)
+
+
+def _linear_targets(drive: CanopenDrive) -> str:
+    """Return what a recording says of a drive that goes straight from target to target."""
+    lag = f"{drive.axis}={drive.profile.torque_lag!r}"
+    if "velocity_ff" in drive.profile.feed_forward:
+        return lag  # it is switched off while frequency responses are measured
+    share = read_loop(drive).get("velocity_ff", 0.0)
+    return f"{lag}/{share!r}" if share else lag
 
 
 def axes_of(group: CanopenGroup, setting: Setting) -> Axes:

@@ -8,7 +8,7 @@ What faces do not imitate is said in each of them, and in ``Face.not_imitated``.
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Protocol
 
@@ -141,6 +141,15 @@ class Face:
     the communication."""
     lock: Lock | None = None
     not_imitated: tuple[str, ...] = ()
+
+    @property
+    def shown(self) -> tuple[ObjectEntry, ...]:
+        """Its objects as others see them."""
+        visible = (
+            replace(o, entries=tuple(e for e in o.entries if e.key not in self.hidden))
+            for o in self.objects
+        )
+        return tuple(o for o in visible if o.entries)
 
     @property
     def entries(self) -> dict[Key, Entry]:

@@ -1,0 +1,164 @@
+"""Whole sessions on machines with makers' drives: what is found is what the reference drive finds.
+
+Two kinds of drives stand on one bus.  Masses and springs have to be those of the machine behind;
+gains that are written have to arrive in the firmware, which converts by the makers' own formulas.
+"""
+
+from pathlib import Path
+
+import pytest
+
+from drives.errors import DrivesError, NotSupportedError
+from drives.sim.servo_kernel import Parameter
+from fieldtool import workflow
+from fieldtool.workflow import Options, SessionResult
+from tests.faces import machine_of, simulated
+
+PAIRS = {
+    "reference": ("reference", "reference"),
+    "epos4": ("epos4*", "epos4-dual-loop"),
+    "novanta": ("novanta*", "epos4-dual-loop"),
+    "elmo": ("elmo-gold", "cia402*"),
+    "copley": ("copley*", "nanotec*"),
+}
+"""A star: the packaged profile with its unknown facts filled in."""
+WRITTEN = ("reference", "epos4", "novanta")
+CLOSE = {"epos4": 5e-3}
+"""Relative; a PID with D on the error feeds the reference's velocity forward in steps, and what they
+do within one SYNC is taken off to first order.  Else 2e-4: rounding and noise."""
+GAINS = ("position_p", "velocity_p", "velocity_i", "inertia_ff")
+
+
+def numbers(result: SessionResult) -> dict[str, float]:
+    """Masses, springs and couplings by name."""
+    found = {}
+    for axis in result.model.axes:
+        found |= {f"{axis.name} mass {k}": m.value for k, m in enumerate(axis.masses)}
+        found |= {f"{axis.name} spring {k}": s.value for k, s in enumerate(axis.springs)}
+    found |= {"-".join(c.axes): c.value for c in result.model.couplings}
+    return found
+
+
+@pytest.fixture(scope="module")
+def sessions(tmp_path_factory):
+    """Each pair's session once, with what its firmware holds before and after a power cycle."""
+    done = {}
+
+    def session(pair: str):
+        if pair not in done:
+            folder = tmp_path_factory.mktemp(pair)
+            machine = machine_of(PAIRS[pair], folder)
+            options = Options(write=pair in WRITTEN, store=pair in WRITTEN)
+            with simulated(machine) as running:
+                result = workflow.run(machine, folder / "one", options, confirm=lambda _: True)
+                held = [settings(running, k) for k in range(2)]
+                for node in running.nodes:
+                    node.power_cycle()
+                again = [settings(running, k) for k in range(2)]
+            done[pair] = result, held, again
+        return done[pair]
+
+    return session
+
+
+def settings(running, axis: int) -> dict[str, float]:
+    return {name: running.axes.get(axis, Parameter[name.upper()]) for name in GAINS}
+
+
+@pytest.mark.parametrize("pair", [p for p in PAIRS if p != "reference"])
+def test_what_is_found_is_what_the_reference_drive_finds(sessions, pair):
+    found, reference = numbers(sessions(pair)[0]), numbers(sessions("reference")[0])
+    print({k: f"{found[k] / reference[k] - 1:+.2e}" for k in reference})
+    assert found == pytest.approx(reference, rel=CLOSE.get(pair, 2e-4))
+
+
+@pytest.mark.parametrize("pair", WRITTEN)
+def test_what_is_written_acts_as_it_was_designed(sessions, pair):
+    result, held, again = sessions(pair)
+    for axis, firmware in zip(result.tuning.axes, held, strict=True):
+        designed = {n: v for n, v in axis.parameters.items() if n in GAINS}
+        assert set(designed) >= {"position_p", "velocity_p", "velocity_i"}
+        assert {n: firmware[n] for n in designed} == pytest.approx(designed, rel=1e-3)
+    assert result.write_back.stored
+    for one, other in zip(held, again, strict=True):
+        assert other == pytest.approx(one, rel=1e-12)  # it survived the power cycle
+
+
+def test_gains_that_no_object_holds_are_designed_but_not_written(sessions):
+    result, held, _ = sessions("elmo")
+    assert set(result.tuning.axes[0].parameters) == {"position_p", "velocity_p", "velocity_i"}
+    assert not result.write_back.written
+    assert any("only through its own language" in w for w in result.warnings)
+    assert held[0]["position_p"] == 15
+
+
+def test_writing_them_is_refused_and_touches_no_drive(tmp_path):
+    machine = machine_of(("elmo-gold", "epos4-dual-loop"), tmp_path)
+    from drives.canopen_drive import connect
+    from fieldtool.design.tuning import AxisTuning, Tuning
+    from fieldtool.writeback.transaction import changes_for
+
+    gains = {"position_p": 10.0, "velocity_p": 1.0, "velocity_i": 5.0}
+    tuning = Tuning(tuple(AxisTuning(n, gains, 1.5, "") for n in ("table", "arm")))
+    with simulated(machine) as running:
+        before = [settings(running, k) for k in range(2)]
+        with connect(machine) as group, pytest.raises(NotSupportedError) as refused:
+            changes_for(group.drives, tuning)
+        assert [settings(running, k) for k in range(2)] == before
+    assert str(refused.value) == (
+        "table: the drive's gains are reached only through its own language, not through objects "
+        "(drive profile elmo-gold). Enter position_p, velocity_p, velocity_i with the maker's "
+        "software. Nothing was written."
+    )
+
+
+@pytest.mark.parametrize(
+    ("drive", "sentence"),
+    [
+        (
+            "prbt",
+            "table: the drive has no mode cyclic position (8); 0x6502 is 0x00000043: profile position, "
+            "velocity, interpolated position. This tool can not measure with it; nothing was moved.",
+        ),
+        (
+            "elmo-simpliq",
+            "table: the drive has no mode cyclic position (8); 0x6502 is 0x0000006D: profile position, "
+            "profile velocity, profile torque, homing, interpolated position. This tool can not measure "
+            "with it; nothing was moved.",
+        ),
+    ],
+)
+def test_a_drive_without_cyclic_modes_is_refused_before_motion(tmp_path, drive, sentence):
+    machine = machine_of((drive, "reference"), tmp_path)
+    with simulated(machine) as running, pytest.raises(DrivesError) as refused:
+        workflow.run(machine, tmp_path / "one")
+    assert str(refused.value) == sentence
+    assert running.sync_count == 0
+
+
+@pytest.mark.parametrize(
+    ("drive", "change", "said"),
+    [
+        ("novanta", {}, "does not know what the drive's torque units are worth (`torque`)"),
+        ("cia402*", {"eds": None}, "ships no EDS file. Give the drive's own EDS with `eds:`"),
+        ("cia402*", {"loop": None}, "give them as `loop` at the axis in the machine profile"),
+        ("nanotec*", {"torque_constant": None}, "Give the motor's `torque_constant` (N m/A)"),
+        (
+            "elmo-gold",
+            {"encoder_counts_per_rev": None},
+            "give `encoder_counts_per_rev` at the axis",
+        ),
+    ],
+)
+def test_what_is_not_known_is_asked_for_in_one_sentence(tmp_path, drive, change, said):
+    machine = machine_of((drive, "reference"), tmp_path, table=change)
+    with simulated(machine) as running, pytest.raises(DrivesError) as refused:
+        workflow.run(machine, tmp_path / "one")
+    assert said in str(refused.value)
+    assert "\n" not in str(refused.value)
+    assert running.sync_count == 0
+
+
+def test_profiles_of_the_simulated_machine_stand_beside_it(tmp_path):
+    machine = machine_of(("novanta*", "reference"), tmp_path)
+    assert Path(machine.axes[0].drive).parent == tmp_path
