@@ -31,6 +31,11 @@ def open_bus(profile: BusProfile) -> can.BusABC:
     """
     if profile.interface == SOCKETCAN:
         check_link(profile)
+    elif profile.sync == "kernel":
+        raise BusError(
+            f"the kernel can give the SYNC on SocketCAN only, not on {profile.interface}. Set "
+            "`sync: host` in the machine profile's bus."
+        )
     kind: Any = bus_class(profile.interface)
     check_options(profile.interface, profile.options)
     if profile.interface == SOCKETCAN:

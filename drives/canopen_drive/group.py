@@ -16,6 +16,7 @@ from drives.canopen_drive.line import Line
 from drives.canopen_drive.motion import CanopenMotion
 from drives.canopen_drive.pace import Punctuality, undisturbed
 from drives.canopen_drive.recovery import recover
+from drives.canopen_drive.sync import SYNC_ID, HostSync, KernelSync
 from drives.canopen_drive.torque_offset import why_not
 from drives.cia402 import Mode
 from drives.errors import DrivesError, LimitsError, NothingMovedError, NotSupportedError
@@ -23,7 +24,6 @@ from drives.objects import ObjectInfo
 from drives.profile import AxisProfile, DriveProfile, MachineProfile, load_drive
 from drives.trace import traced
 
-SYNC_ID = 0x080
 START_NODE, ENTER_PRE_OPERATIONAL = 0x01, 0x80
 LISTENING_TIME = 0.3
 """Seconds for which the bus is listened to before anything is changed."""
@@ -167,8 +167,11 @@ class CanopenGroup:
                 stack.callback(self._leave_operational, drive)
             for drive in self._drives:
                 drive.node.nmt.send_command(START_NODE)
+            sync = self._sync(cycle_time)
+            stack.callback(sync.close)
+            floating = frozenset(free)
             motion = CanopenMotion(
-                self.line, self._drives, cycle_time, frozenset(free), self._stop_requested, offsets
+                self.line, self._drives, cycle_time, floating, self._stop_requested, offsets, sync
             )
             motion.perhaps_enabled = unsure
             motion.real_time = stack.enter_context(undisturbed(self.line.clock))
@@ -182,6 +185,17 @@ class CanopenGroup:
             except BaseException as error:
                 motion.stop(error)
                 raise
+
+    def _sync(self, cycle_time: float) -> HostSync:
+        if self.machine.bus.sync == "host":
+            return HostSync(self.line, cycle_time)
+        try:
+            return KernelSync(self.line, cycle_time)
+        except can.CanError as error:
+            raise NotSupportedError(
+                f"the kernel can not give the SYNC ({error}). Set `sync: host` in the machine "
+                "profile's bus."
+            ) from error
 
     def _offset_axes(self, free: Collection[str]) -> frozenset[str]:
         """Return the axes that torque offsets are streamed to."""

@@ -16,8 +16,9 @@ from drives.canopen_drive.drive import CanopenDrive
 from drives.canopen_drive.interrupts import uninterrupted
 from drives.canopen_drive.line import Line
 from drives.canopen_drive.outputs import Outputs, outputs_of
-from drives.canopen_drive.pace import Pace, Punctuality
+from drives.canopen_drive.pace import Punctuality
 from drives.canopen_drive.setup import HOST_HEARTBEAT, HOST_LOST_AFTER
+from drives.canopen_drive.sync import HostSync, Sync
 from drives.cia402 import ENABLED_VALUE, STEP_TOWARDS_ENABLED, Controlword, PowerState
 from drives.errors import (
     DriveFaultError,
@@ -56,6 +57,7 @@ class CanopenMotion:
         free: frozenset[str],
         stop_requested: Callable[[], bool],
         offsets: frozenset[str] = frozenset(),
+        sync: Sync | None = None,
     ) -> None:
         self._line, self._cycle_time, self._stop_requested = line, cycle_time, stop_requested
         self._channels = [
@@ -63,8 +65,8 @@ class CanopenMotion:
         ]
         self._by_cob = {0x180 + c.drive.node_id: k for k, c in enumerate(self._channels)}
         self._by_node = {c.drive.node_id: c for c in self._channels}
-        self._sync = can.Message(arbitration_id=0x80, is_extended_id=False)
-        self._pace = Pace(line.clock, cycle_time)
+        self._sync: Sync = sync or HostSync(line, cycle_time)
+        self._disturbed = False
         self._lost = line.overruns
         self._lost_before = self._lost
         self._count = 0
@@ -89,11 +91,11 @@ class CanopenMotion:
     @property
     def punctuality(self) -> Punctuality:
         """How well the host has kept its cycles so far."""
-        pace = self._pace
+        sync = self._sync
         return Punctuality(
-            pace.cycles,
-            pace.late,
-            pace.worst,
+            sync.cycles,
+            sync.late,
+            sync.worst,
             self._cycle_time,
             self._line.overruns - self._lost_before,
             self.real_time,
@@ -142,7 +144,7 @@ class CanopenMotion:
         """
         now = self._line.clock.now()
         self._count = 0
-        self._pace.restart()
+        self._sync.restart()
         for channel in self._channels:
             node_id = channel.drive.node_id
             channel.heard = now
@@ -177,7 +179,7 @@ class CanopenMotion:
         taken for the next cycle's ever after.
         """
         self._line.wait(PAUSE_CYCLES * self._cycle_time)
-        self._pace.restart()
+        self._sync.restart()
         words = [self._word(c, Controlword.DISABLE_VOLTAGE) for c in self._channels]
         for _ in range(REPLY_TRIES):
             if self._cycle(words):
@@ -384,30 +386,27 @@ class CanopenMotion:
             channel.output.data = bytearray(output)
             line.send(channel.output)
         line.beat()
-        moment = self._pace.begin()
-        disturbed = self._take_late_frames()
-        line.send(self._sync)
+        self._disturbed = False
+        moment = self._sync.give(self._early)
         self._count += 1
         complete = self._collect(moment + REPLY_SHARE * self._cycle_time)
-        return complete and not self._pace.lateness and not disturbed and not self._lost_frames()
+        spoiled = self._disturbed or self._sync.lateness > 0 or self._lost_frames()
+        return complete and not spoiled
 
     def _lost_frames(self) -> bool:
         """Whether received frames were lost since this was asked last."""
         before, self._lost = self._lost, self._line.overruns
         return self._lost != before
 
-    def _take_late_frames(self) -> bool:
-        """Hand on what came since the last cycle; return whether a drive's PDO was among it.
+    def _early(self, message: can.Message) -> None:
+        """Hand on a frame that came before the SYNC.
 
-        That PDO came too late for its SYNC, or the drive answered a SYNC that is not ours.
+        A drive's PDO among them came too late for its SYNC, or answers a SYNC that is not ours.
         """
-        disturbed = False
-        while (message := self._line.receive(0.0)) is not None:
-            if message.arbitration_id in self._by_cob and not message.is_extended_id:
-                disturbed = True
-            else:
-                self._hand_on(message)
-        return disturbed
+        if message.arbitration_id in self._by_cob and not message.is_extended_id:
+            self._disturbed = True
+        else:
+            self._hand_on(message)
 
     def _collect(self, deadline: float) -> bool:
         by_cob, channels, clock = self._by_cob, self._channels, self._line.clock
@@ -450,9 +449,9 @@ class CanopenMotion:
             channel.rebooted = True
 
     def _check_lateness(self) -> None:
-        if self._pace.lateness > MOST_LATE:
+        if self._sync.lateness > MOST_LATE:
             raise SafetyStopError(
-                f"this computer stood still for {1000 * self._pace.lateness:.0f} ms; a cycle may begin "
+                f"this computer stood still for {1000 * self._sync.lateness:.0f} ms; a cycle may begin "
                 f"{1000 * MOST_LATE:.0f} ms late at most. All axes were stopped. Close other programs, "
                 "switch power saving off, and start again.",
                 cycle=self._count - 1,

@@ -1,4 +1,4 @@
-"""The host's pace: when each cycle begins, how late it was, and what it takes to be in time."""
+"""How well the host keeps its cycles, and what it takes to be in time."""
 
 import gc
 import os
@@ -12,8 +12,6 @@ LATE_SHARE = 0.25
 """Share of a cycle by which the host may be late; a block with a later cycle is measured again."""
 REAL_TIME_PRIORITY = 40
 """Of SCHED_FIFO: above ordinary programs, below the kernel's own threads."""
-_BEFORE_NOW = 1e-7
-"""Seconds by which a moment may be early: no clock is finer."""
 
 
 @dataclass(frozen=True)
@@ -73,39 +71,6 @@ class Punctuality:
             "The blocks with them were measured again. To have fewer: close other programs, "
             f"{allow}or give the bus a longer `shortest_cycle` in the machine profile."
         )
-
-
-class Pace:
-    """Begins cycle after cycle at its time; a late one shifts those that follow."""
-
-    def __init__(self, clock: Clock, cycle_time: float) -> None:
-        self._clock, self._cycle_time = clock, cycle_time
-        self._start, self._count = clock.now() + cycle_time, 0
-        self.cycles = self.late = 0
-        self.worst = self.lateness = 0.0
-        """Largest lateness, and that of the present cycle, s; 0 where it is not late."""
-
-    def restart(self) -> None:
-        """Begin anew: the next cycle is one cycle time from now."""
-        self._start, self._count = self._clock.now() + self._cycle_time, 0
-
-    def begin(self) -> float:
-        """Wait for the next cycle's moment, and return it; a late one's moment is now."""
-        moment = self._start + self._count * self._cycle_time
-        self._clock.wait_until(moment - _BEFORE_NOW)
-        self.note(self._clock.now() - moment)
-        if self.lateness:
-            self._start += self.lateness
-            moment += self.lateness
-        return moment
-
-    def note(self, late: float) -> None:
-        """Count a cycle that began so late, s."""
-        self._count += 1
-        self.cycles += 1
-        self.worst = max(self.worst, late)
-        self.lateness = late if late > LATE_SHARE * self._cycle_time else 0.0
-        self.late += self.lateness > 0
 
 
 @contextmanager

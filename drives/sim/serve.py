@@ -8,6 +8,7 @@ import can
 
 from drives.bus import WallClock
 from drives.canopen_drive.pace import undisturbed
+from drives.cia402 import Mode
 from drives.sim.running import RunningMachine
 from drives.sim.scheduler import NANOSECONDS, nanoseconds
 
@@ -17,8 +18,8 @@ LARGEST_STEP = 0.05
 """Wall time, s, that is made up for at most at once; what a longer pause held is left out."""
 LATE = 0.002
 """Seconds between two looks at the bus above which the computer did not keep up."""
-WARM_UP = 0.01
-"""Virtual seconds that another machine of the kind lives first, so that all is compiled."""
+WARM_UP = 0.002
+"""Virtual seconds of each step that another machine of the kind does first, so that all is compiled."""
 PAUSE = 0.01
 """Seconds between two tries of a bus that takes and gives nothing."""
 
@@ -161,11 +162,18 @@ class _Line:
 
 
 def _compile(machine: RunningMachine) -> None:
+    """Let another machine of the kind do once whatever a drive has to do in time."""
     other = RunningMachine(machine.description)
     for node in other.nodes:
         other.receive(0, bytes((1, node.node_id)))
-    other.receive(0x80, b"")
-    other.advance_to(nanoseconds(WARM_UP))
+        node.dictionary.write(0x6060, 0, Mode.CYCLIC_POSITION.value)
+    for word in (0x06, 0x07, 0x0F, 0x0F, 0x02, 0x00):
+        for node in other.nodes:
+            node.motion.write_controlword(word)
+            node.motion.set_target_position(10 * word)
+        for _ in range(3):
+            other.receive(0x80, b"")
+            other.advance_to(other.time + nanoseconds(WARM_UP))
 
 
 def _is_for_nodes(message: can.Message) -> bool:

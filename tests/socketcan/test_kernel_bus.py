@@ -17,6 +17,7 @@ import pytest
 from drives.bus import open_bus
 from drives.bus.kernel_bus import KernelBus
 from drives.bus.kernel_link import kernel_links
+from drives.bus.kernel_sync import LEASE, LeasedSync
 from drives.canopen_drive import connect
 from drives.canopen_drive.line import Line
 from drives.errors import BusError
@@ -147,6 +148,67 @@ def drained(terminal: int) -> None:
     with contextlib.suppress(OSError):
         while os.read(terminal, 4096):
             pass
+
+
+def syncs(bus: KernelBus, seconds: float) -> list[float]:
+    """Return the time stamps of the SYNCs of so many seconds."""
+    stamps, deadline = [], time.monotonic() + seconds
+    while (left := deadline - time.monotonic()) > 0:
+        message = bus.recv(left)
+        if message is not None and message.arbitration_id == 0x080:
+            stamps.append(message.timestamp)
+    return stamps
+
+
+def test_the_broadcast_manager_s_sync_ends_with_its_lease() -> None:
+    with opened() as near:
+        sync = LeasedSync("vcan1")
+        try:
+            sync.start(CYCLE)
+            assert len(syncs(near, 0.3)) == LEASE, "nobody renewed it"
+            sync.renew(CYCLE)
+            assert syncs(near, 0.2) == [], "what has ended is not renewed"
+            sync.start(CYCLE)
+            for _ in range(10):
+                stamps = syncs(near, CYCLE / 2)
+                sync.renew(CYCLE)
+            stamps = syncs(near, 0.3)
+            assert len(stamps) == LEASE
+            sync.start(CYCLE)
+            sync.stop()
+            assert len(syncs(near, 0.2)) == 1
+        finally:
+            sync.close()
+
+
+def test_the_kernel_s_sync_keeps_its_pace_and_answers_come(drives) -> None:
+    machine = load_machine(MACHINE)
+    kernel = machine.model_copy(update={"bus": machine.bus.model_copy(update={"sync": "kernel"})})
+    rows = 300
+    with opened("vcan0") as other, connect(kernel) as group:
+        with group.motion(CYCLE) as motion:
+            hold = np.tile(motion.position, (rows // 3, 1))
+            blocks = [hold] * 3
+            other.focus([0x080])
+            while other.recv(0) is not None:
+                pass
+            capture = motion.stream(lambda _: blocks.pop() if blocks else None)
+            stamps = [m.timestamp for _ in range(2 * rows) if (m := other.recv(0)) is not None]
+        kept = group.punctuality
+    assert capture.rows == rows
+    print(kept.sentence, len(capture.missing), "rows spoiled")
+    assert len(capture.missing) < rows / 4
+    assert len(stamps) >= rows
+    steps = np.diff(stamps[:rows])
+    print("SYNC every", np.percentile(1000 * steps, [0, 5, 50, 95, 100]), "ms")
+    assert np.median(steps) == pytest.approx(CYCLE, rel=0.1)
+    assert stamps[rows - 1] - stamps[0] == pytest.approx((rows - 1) * CYCLE, rel=0.02)
+
+
+def test_the_kernel_gives_the_sync_on_its_own_bus_only() -> None:
+    bus = BusProfile(interface="virtual", channel="x", sync="kernel")
+    with pytest.raises(BusError, match="on SocketCAN only, not on virtual"):
+        open_bus(bus)
 
 
 @pytest.fixture

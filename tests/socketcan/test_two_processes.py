@@ -12,6 +12,7 @@ import time
 import numpy as np
 import pytest
 
+from drives.bus.kernel_sync import LEASE
 from drives.canopen_drive import connect
 from drives.canopen_drive.setup import HOST_HEARTBEAT, HOST_LOST_AFTER
 from drives.profile import load_machine
@@ -26,9 +27,12 @@ SPEED = 1.0
 """rad/s: of the motions that are cut off, about."""
 
 
-def swing(forever: float = 60.0) -> None:
+def swing(sync: str = "host", forever: float = 60.0) -> None:
     """Connect, enable both axes and move them, until something ends it."""
-    with connect(load_machine(MACHINE)) as group, group.motion(CYCLE) as motion:
+    machine = load_machine(MACHINE)
+    bus = machine.bus.model_copy(update={"sync": sync})
+    machine = machine.model_copy(update={"bus": bus})
+    with connect(machine) as group, group.motion(CYCLE) as motion:
         start = motion.position
         print("MOVING", flush=True)
         rows = 0
@@ -67,13 +71,13 @@ def lost_after(frames) -> dict[int, float]:
     return found
 
 
-@pytest.mark.parametrize("attempt", range(3))
+@pytest.mark.parametrize("sync", ["host", "kernel"])
 def test_sigkill_in_motion_stops_every_drive_by_its_own_heartbeat_consumer(
-    drives, listener, start, attempt
+    drives, listener, start, sync
 ) -> None:
     wait = random.uniform(0.3, 3.0)
     print(f"killed {wait:.3f} s into the motion")
-    master = start(swing)
+    master = start(lambda: swing(sync))
     master.wait_for("MOVING")
     time.sleep(wait)
     assert listener.enabled(TABLE), master.text
@@ -108,12 +112,21 @@ def test_sigkill_of_the_tool_in_a_sweep(drives, listener, start, tmp_path) -> No
     assert_still(listener)
 
 
-def test_a_host_that_stands_still_finds_stopped_drives_and_says_so(drives, listener, start) -> None:
-    master = start(swing)
+@pytest.mark.parametrize("sync", ["host", "kernel"])
+def test_a_host_that_stands_still_finds_stopped_drives_and_says_so(
+    drives, listener, start, sync
+) -> None:
+    """A kernel that gives the SYNC does not go on without the host."""
+    master = start(lambda: swing(sync))
     master.wait_for("MOVING")
     time.sleep(1.0)
+    listener.forget()
+    heard = listener.heard(0.1)
     os.kill(master.pid, signal.SIGSTOP)
-    time.sleep(0.6)
+    stopped = time.time()
+    heard += listener.heard(0.6)
+    after = [m for m in heard if m.arbitration_id == 0x080 and m.timestamp > stopped + 0.001]
+    assert len(after) <= (LEASE if sync == "kernel" else 0)
     for node in (TABLE, ARM):
         assert not listener.enabled(node), "the drive did not wait for the host to come back"
     os.kill(master.pid, signal.SIGCONT)

@@ -20,7 +20,7 @@ const write = (index, subIndex, dataType, data) =>
 const sleep = (ms) => new Promise((resolve) => setTimeout(resolve, ms));
 
 async function main() {
-    const found = { heartbeats: [], pdos: [], aborts: [] };
+    const found = { answers: 0, heartbeats: [], pdos: [], aborts: [] };
     device.eds.addSdoClientParameter(node, 0x600 | node, 0x580 | node);
     device.eds.addHeartbeatConsumer(node, 500);
     const status = device.eds.addEntry(0x2041, { parameterName: 'statusword', dataType: UNSIGNED16 });
@@ -30,6 +30,8 @@ async function main() {
     device.eds.setSyncGenerationEnable(true);
     device.eds.setSyncCyclePeriod(20000);
     device.nmt.addListener('heartbeat', (beat) => found.heartbeats.push(beat.deviceId ?? beat));
+    channel.addListener('onMessage', ({ id }) => found.answers += id === (0x180 | node));
+    // told only where a value has changed
     device.pdo.on('pdo', ({ cobId, dataObjects }) =>
         found.pdos.push([cobId, ...dataObjects.map((object) => object.value)]));
     channel.start();
@@ -59,7 +61,8 @@ async function main() {
     for (const word of [6, 7, 15])
         await write(0x6040, 0, UNSIGNED16, word);
     found.enabled = await read(0x6041, 0, UNSIGNED16);
-    await sleep(1000);
+    for (let k = 0; k < 200 && found.answers < 20; ++k)
+        await sleep(50);
     await write(0x6040, 0, UNSIGNED16, 0);
     found.disabled = await read(0x6041, 0, UNSIGNED16);
     found.state = await device.nmt.getNodeState(node);

@@ -1,0 +1,150 @@
+"""Who gives the beat: SYNC from the host itself, or from the kernel, and how late each was."""
+
+import time
+from collections.abc import Callable
+from typing import Protocol
+
+import can
+
+from drives.bus.kernel_sync import LeasedSync
+from drives.canopen_drive.line import Line
+from drives.canopen_drive.pace import LATE_SHARE
+
+SYNC_ID = 0x080
+_BEFORE_NOW = 1e-7
+"""Seconds by which a moment may be early: no clock is finer."""
+PULL, MOST_PULL = 0.3, 0.2
+"""Share of the kernel's lateness that its next period makes up for, and largest change of a period."""
+GONE = 1.5
+"""Cycles without the kernel's SYNC after which its lease has ended."""
+
+Early = Callable[[can.Message], None]
+"""Takes a frame that came before the SYNC."""
+
+
+class Sync(Protocol):
+    """Gives a SYNC for every cycle, after the targets were sent."""
+
+    cycles: int
+    late: int
+    """Cycles that began later than LATE_SHARE of a cycle."""
+    worst: float
+    """Largest lateness, s."""
+    lateness: float
+    """Of the present cycle, s; 0 where it is not late."""
+
+    def restart(self) -> None:
+        """Begin anew: the next cycle is one cycle time from now."""
+
+    def give(self, early: Early) -> float:
+        """Have the next SYNC sent; return the time at which it was, by the bus' clock."""
+
+    def close(self) -> None:
+        """Send none any more."""
+
+
+class HostSync:
+    """The host sends it; a late one shifts those that follow.
+
+    However long the host is held up, no drive sees a SYNC without new targets.
+    """
+
+    def __init__(self, line: Line, cycle_time: float) -> None:
+        self._line, self._cycle_time = line, cycle_time
+        self._message = can.Message(arbitration_id=SYNC_ID, is_extended_id=False)
+        self._start, self._count = line.clock.now() + cycle_time, 0
+        self.cycles = self.late = 0
+        self.worst = self.lateness = 0.0
+
+    def restart(self) -> None:
+        """Begin anew: the next cycle is one cycle time from now."""
+        self._start, self._count = self._line.clock.now() + self._cycle_time, 0
+
+    def give(self, early: Early) -> float:
+        """Wait for the next cycle's moment, take what came until then, and send a SYNC."""
+        line, clock = self._line, self._line.clock
+        moment = self._start + self._count * self._cycle_time
+        clock.wait_until(moment - _BEFORE_NOW)
+        late = clock.now() - moment
+        self._count += 1
+        self._note(late)
+        if self.lateness:
+            self._start += late
+            moment += late
+        while (message := line.receive(0.0)) is not None:
+            early(message)
+        line.send(self._message)
+        return moment
+
+    def close(self) -> None:
+        """Nothing is left to do."""
+
+    def _note(self, late: float) -> None:
+        self.cycles += 1
+        self.worst = max(self.worst, late)
+        self.lateness = late if late > LATE_SHARE * self._cycle_time else 0.0
+        self.late += self.lateness > 0
+
+
+class KernelSync(HostSync):
+    """The kernel's broadcast manager sends it, on a lease that every cycle renews.
+
+    The kernel's timer begins each period when the one before has ended, late or not, so its period is
+    a little long; time stamps show by how much, and the next period makes up for it.
+    """
+
+    def __init__(self, line: Line, cycle_time: float) -> None:
+        super().__init__(line, cycle_time)
+        self._lease = LeasedSync(str(getattr(line.can_bus, "channel", "")), SYNC_ID)
+        self._origin: float | None = None
+        """Time stamp of the first SYNC of the present count; None before it."""
+        self._period = cycle_time
+
+    def restart(self) -> None:
+        """Begin anew with the next cycle."""
+        if self._origin is not None:
+            self._lease.stop()
+        self._origin, self._count, self._period = None, 0, self._cycle_time
+
+    def give(self, early: Early) -> float:
+        """Renew the lease, and wait for the SYNC that acts on the targets just sent.
+
+        One that came before they were all sent is no SYNC of this cycle: the cycle is late.
+        """
+        line = self._line
+        sent, overtaken = time.time(), 0.0
+        if self._origin is None:
+            self._lease.start(self._period)
+        else:
+            self._lease.renew(self._period)
+        while True:
+            message = line.receive(GONE * self._cycle_time)
+            if message is None:  # the lease had ended: the host was very late
+                self._origin, self._count = None, 0
+                overtaken = max(overtaken, GONE * self._cycle_time)
+                self._lease.start(self._cycle_time)
+            elif message.arbitration_id != SYNC_ID or message.is_extended_id:
+                early(message)
+            elif message.timestamp < sent:
+                overtaken = max(overtaken, sent - message.timestamp)
+                self._count += 1
+            else:
+                break
+        self._follow(message.timestamp, overtaken)
+        return line.clock.now() - max(0.0, time.time() - message.timestamp)
+
+    def _follow(self, stamp: float, overtaken: float) -> None:
+        """Take note of how late a SYNC was, and choose the next period."""
+        if self._origin is None:
+            self._origin, self._count = stamp, 0
+        phase = stamp - self._origin - self._count * self._cycle_time
+        if abs(phase) > self._cycle_time / 2:  # the clock was set, or the kernel was held up
+            self._origin, self._count = stamp, 0
+        self._count += 1
+        most = MOST_PULL * self._cycle_time
+        self._period = self._cycle_time - min(most, max(-most, PULL * phase))
+        self._note(max(overtaken, phase))
+
+    def close(self) -> None:
+        """Send none any more."""
+        self._lease.close()
