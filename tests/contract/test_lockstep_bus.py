@@ -410,12 +410,13 @@ class TestServing:
                 super().send(msg, timeout)
 
         with Cut(channel="cut") as far, can.Bus(interface="virtual", channel="cut") as near:
-            ended, reports = threading.Event(), []
+            ended, ready, reports = threading.Event(), threading.Event(), []
             thread = threading.Thread(
-                target=lambda: reports.append(serve(running, far, ended.is_set))
+                target=lambda: reports.append(serve(running, far, ended.is_set, begun=ready.set))
             )
             thread.start()
             try:
+                assert ready.wait(60.0)
                 time.sleep(0.2)
                 gone[0] = False
                 near.send(frame(0x601, UPLOAD_DEVICE_TYPE))
