@@ -74,9 +74,12 @@ EXTRAS = {
 }
 """Extras of python-can that an interface needs, or is better with."""
 BITRATE_ELSEWHERE = frozenset(
-    {"socketcan", "serial", "socketcand", "udp_multicast", "virtual", "fieldsim"}
+    {"socketcan", "serial", "socketcand", "udp_multicast", "virtual", "fieldsim", "fieldreplay"}
 )
 """Interfaces whose bit rate is set by somebody else, or that have none."""
+
+BACKENDS.setdefault("fieldreplay", ("drives.replay.replay_bus", "ReplayBus"))
+"""Known from its entry point too; an installation in place may be older than that."""
 
 
 def bus_class(interface: str) -> type[can.BusABC]:

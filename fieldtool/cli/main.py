@@ -34,6 +34,7 @@ from fieldtool import workflow
 from fieldtool.cli.bus_options import Bitrate, Channel, Interface, on_bus
 from fieldtool.cli.check import check
 from fieldtool.cli.output import console_of, print_json
+from fieldtool.cli.replay import replay_command
 from fieldtool.cli.restored import show_restored
 from fieldtool.cli.scan import scan
 from fieldtool.cli.screen import (
@@ -493,6 +494,7 @@ def simulate(
 
 app.command()(scan)
 app.command()(check)
+app.command("replay")(replay_command)
 
 
 def _lengths(masses: Sequence[str]) -> dict[str, int]:
@@ -518,7 +520,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         app(args=None if arguments is None else list(arguments))
     except (FieldtoolError, DrivesError) as error:
         sys.stderr.write(f"fieldtool: {error}\n")
-        for note in getattr(error, "__notes__", ()):
+        for note in dict.fromkeys(getattr(error, "__notes__", ())):
             sys.stderr.write(f"fieldtool: {note}\n")
         sys.exit(exit_code(error))
     except KeyboardInterrupt:

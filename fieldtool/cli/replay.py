@@ -1,0 +1,253 @@
+"""``fieldtool replay``: a session shown again from its trace, without drives."""
+
+import sys
+from contextlib import suppress
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from drives.objects import ObjectAddress
+from drives.profile import MachineProfile
+from drives.replay import Decoded
+from fieldtool.cli.output import console_of, print_json
+from fieldtool.cli.screen import TerminalScreen
+from fieldtool.cli.stop_key import stop_key
+from fieldtool.cli.tracing import unused
+from fieldtool.workflow.replay_again import Again, again
+from fieldtool.workflow.replaying import Replayed, Wanted, find_source, replay
+
+KINDS = ("nmt", "sync", "sdo", "pdo", "emcy", "heartbeat", "error", "other")
+DIFFERS = 3
+"""Exit code when something else was sent or measured than then."""
+MOST_LINES = 12
+"""Lines of aborts, emergencies ... that are shown."""
+
+
+def replay_command(
+    source: Annotated[Path, typer.Argument(help="Session folder with a trace, or a trace file.")],
+    frames: Annotated[bool, typer.Option("--frames", help="Show every frame, decoded.")] = False,
+    kind: Annotated[
+        list[str] | None,
+        typer.Option("--kind", help=f"Show frames of this kind: {', '.join(KINDS)}. Repeatable."),
+    ] = None,
+    node: Annotated[
+        list[int] | None, typer.Option("--node", help="Show frames of this node. Repeatable.")
+    ] = None,
+    wanted_object: Annotated[
+        list[str] | None,
+        typer.Option("--object", help="Show frames with this object, as 0x6041. Repeatable."),
+    ] = None,
+    begin: Annotated[
+        float | None, typer.Option("--from", help="Seconds since the first frame.")
+    ] = None,
+    end: Annotated[
+        float | None, typer.Option("--to", help="Seconds since the first frame.")
+    ] = None,
+    limit: Annotated[
+        int | None, typer.Option("--limit", help="Show so many frames at most.", min=1)
+    ] = None,
+    machine: Annotated[
+        str | None, typer.Option("--machine", help="Machine profile; the session's otherwise.")
+    ] = None,
+    do_again: Annotated[
+        bool,
+        typer.Option("--again", help="Let the tool do the session again, on the trace alone."),
+    ] = False,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Folder for what --again makes.")
+    ] = None,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print one JSON object and nothing else.")
+    ] = False,
+) -> None:
+    """Show a session again from its trace: what every frame meant, and what they amount to."""
+    console = console_of(as_json)
+    found = find_source(source, machine)
+    if do_again:
+        folder = out or unused(found.trace.parent / "again")
+        with stop_key(), TerminalScreen(console) as screen:
+            done = again(found, folder, screen)
+        _show_again(console, done)
+        if as_json:
+            print_json(
+                {
+                    "folder": str(done.folder),
+                    "same_frames": done.same_frames,
+                    "rows_compared": done.rows,
+                    "differences": list(done.differences),
+                }
+            )
+        if done.differences:
+            sys.exit(DIFFERS)
+        return
+    wanted = _wanted(kind, node, wanted_object, begin, end)
+    listed = _Listed(found.machine, limit, as_json)
+    shown = wanted if frames or wanted != Wanted() else None
+    with stop_key():
+        result = replay(found, shown, listed.take)
+    show(console, result)
+    if listed.left_out:
+        console.print(f"{listed.left_out} more frames were not shown (--limit).")
+    if as_json:
+        data = result.as_dict()
+        if shown is not None:
+            data = {**data, "shown": listed.rows, "not_shown": listed.left_out}
+        print_json(data)
+
+
+def _wanted(
+    kind: list[str] | None,
+    node: list[int] | None,
+    wanted_object: list[str] | None,
+    begin: float | None,
+    end: float | None,
+) -> Wanted:
+    kinds = frozenset(text.lower() for text in kind or ())
+    unknown = kinds - set(KINDS)
+    if unknown:
+        raise typer.BadParameter(
+            f"--kind {', '.join(sorted(unknown))}: there is {', '.join(KINDS)}"
+        )
+    try:
+        addresses = frozenset(ObjectAddress.parse(text) for text in wanted_object or ())
+    except ValueError as error:
+        raise typer.BadParameter(f"--object: {error}") from None
+    return Wanted(kinds, frozenset(node or ()), addresses, begin, end)
+
+
+class _Listed:
+    """Frames as they are shown: printed at once, or kept for the JSON object."""
+
+    def __init__(self, machine: MachineProfile | None, limit: int | None, as_json: bool) -> None:
+        self._names = {a.node_id: a.name for a in machine.axes} if machine is not None else {}
+        self._limit, self._as_json = limit, as_json
+        self.rows: list[dict[str, Any]] = []
+        self.shown = self.left_out = 0
+
+    def take(self, frame: Decoded, seconds: float) -> None:
+        """Show a frame."""
+        if self._limit is not None and self.shown >= self._limit:
+            self.left_out += 1
+            return
+        self.shown += 1
+        if self._as_json:
+            self.rows.append(_row(frame, seconds))
+        else:
+            with suppress(BrokenPipeError):
+                sys.stdout.write(self._line(frame, seconds))
+
+    def _line(self, frame: Decoded, seconds: float) -> str:
+        who = str(frame.node) if frame.node else ""
+        name = self._names.get(frame.node, "")
+        way = ">" if frame.sent else "<"
+        return (
+            f"{frame.number:8d} {seconds:12.6f} {way} {frame.identifier:03X} {frame.kind:9} "
+            f"{who:>3} {name:10} {_plain(frame.text)}\n"
+        )
+
+
+def _row(frame: Decoded, seconds: float) -> dict[str, Any]:
+    return {
+        "number": frame.number,
+        "seconds": seconds,
+        "sent": frame.sent,
+        "identifier": frame.identifier,
+        "data": frame.data.hex(),
+        "kind": frame.kind,
+        "node": frame.node,
+        "object": str(frame.address) if frame.address is not None else None,
+        "text": frame.text,
+        "values": [
+            {
+                "object": str(v.address),
+                "name": v.name,
+                "raw": v.raw if isinstance(v.raw, int | str) else float(v.raw),
+                "physical": v.physical,
+                "unit": v.unit or None,
+            }
+            for v in frame.values
+        ],
+    }
+
+
+def _plain(text: str) -> str:
+    """Return text from the bus without what would act on a terminal."""
+    return "".join(c if c.isprintable() else "?" for c in text)
+
+
+def show(console: Console, result: Replayed) -> None:
+    """Show what a trace amounts to."""
+    s = result.statistics
+    kinds = ", ".join(f"{count} {kind}" for kind, count in s.kinds.items())
+    console.print(Text(f"{result.source.trace}: {s.frames} frames in {s.seconds:.3f} s: {kinds}."))
+    if s.pace is not None:
+        p = s.pace
+        console.print(
+            f"SYNC: {p.syncs}, every {p.median * 1000:.4g} ms (median); deviation "
+            f"{p.deviation * 1e6:.3g} us, shortest {p.shortest * 1000:.4g} ms, longest "
+            f"{p.longest * 1000:.4g} ms; {p.late} late; {p.pauses} pauses."
+        )
+    console.print(
+        f"Bus load: {100 * s.mean_load:.1f} % in the mean, {100 * s.peak_load:.1f} % at most over "
+        "0.1 s (worst-case stuffing)."
+    )
+    if s.pdos:
+        table = Table(box=None, padding=(0, 2))
+        for title in ("PDOs of node", "received", "missing", "doubled"):
+            table.add_column(title, justify="right")
+        for one in s.pdos:
+            table.add_row(*map(str, (one.node, one.received, one.missing, one.doubled)))
+        console.print(table)
+    for what, lines in (
+        ("SDO aborts", s.aborts),
+        ("Emergencies", s.emergencies),
+        ("Boot-ups", s.boots),
+    ):
+        if lines:
+            console.print(Text(f"{what}:"))
+            for line in lines[:MOST_LINES]:
+                console.print(Text(f"  {_plain(line)}"))
+            if len(lines) > MOST_LINES:
+                console.print(f"  ... and {len(lines) - MOST_LINES} more")
+    if s.unanswered:
+        console.print(f"SDO requests without an answer: {s.unanswered}.")
+    _show_recording(console, result)
+
+
+def _show_recording(console: Console, result: Replayed) -> None:
+    if not result.experiments:
+        return
+    rows = sum(one.rows for one in result.experiments)
+    found = sum(one.rows_found for one in result.experiments)
+    same = all(one.whole for one in result.experiments)
+    console.print(
+        Text(
+            f"Recording: {found} of {rows} rows in {len(result.experiments)} experiments are what the "
+            "trace's PDOs say, positions and torques of all axes."
+            + ("" if same else " These are not:"),
+            style="green" if same else "red",
+        )
+    )
+    for one in result.experiments:
+        if not one.whole:
+            console.print(
+                Text(f"  {one.experiment}: {one.rows_found} of {one.rows} rows", style="red")
+            )
+
+
+def _show_again(console: Console, done: Again) -> None:
+    if not done.differences:
+        console.print(
+            Text(
+                f"The tool sent the same frames as then, and recorded the same: {done.rows} rows, every "
+                f"number. What it made is in {done.folder}.",
+                style="green",
+            )
+        )
+        return
+    for text in done.differences:
+        console.print(Text(f"! {text}", style="red"))
