@@ -37,7 +37,7 @@ from drives.units import AxisScaling
 logging.getLogger("canopen").setLevel(logging.CRITICAL)  # what goes wrong is raised, not logged
 
 CIA402_DEVICE = 402
-STOP_NODE = 0x02
+STOP_NODE, ENTER_PRE_OPERATIONAL = 0x02, 0x80
 
 
 class CanopenDrive:
@@ -281,7 +281,7 @@ class CanopenDrive:
         try:
             return self.read_int(objects.DEVICE_TYPE)
         except SdoTimeoutError:
-            self.node.nmt.send_command(0x80)  # a stopped node answers no SDO
+            self.node.nmt.send_command(ENTER_PRE_OPERATIONAL)  # a stopped node answers no SDO
         try:
             return self.read_int(objects.DEVICE_TYPE)
         except SdoTimeoutError:
@@ -302,6 +302,22 @@ class CanopenDrive:
             return True
         except DrivesError:
             return False
+        return True
+
+    def wakes(self, patience: float) -> bool:
+        """Whether the node answers, perhaps after it has booted, or was told to leave NMT stopped.
+
+        Parameters
+        ----------
+        patience
+            Seconds to wait for it at most.
+        """
+        deadline = self.line.clock.now() + patience
+        while not self.answers():
+            if self.line.clock.now() >= deadline:
+                return False
+            with suppress(DrivesError):
+                self.node.nmt.send_command(ENTER_PRE_OPERATIONAL)
         return True
 
     def _text(self, info: ObjectInfo) -> str:

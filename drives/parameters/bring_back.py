@@ -11,6 +11,8 @@ from drives.parameters.backup import DriveBackup
 from drives.parameters.journal import DriveRecord
 from drives.parameters.values import HeldObject, ParameterDrive, Raw, same
 
+PATIENCE = 10.0
+"""Seconds that a drive is given to boot, or to finish storing."""
 PASSES = 3
 """Times that values are written at most: some drives take one only after another."""
 
@@ -93,6 +95,8 @@ def bring_back(
     SilentDriveError
         If the drive does not answer.
     """
+    if not drive.wakes(PATIENCE):
+        raise SilentDriveError(f"{drive.axis}: node {drive.node_id} does not answer")
     found = look(drive, record)
     unlock(drive)
     wanted = {entry.info.address: HeldObject(entry.info, entry.before) for entry in record.entries}

@@ -112,13 +112,18 @@ class Transaction:
     def _check(self, drive: ParameterDrive) -> None:
         """Read a drive's parameters back, and see that they are those of the goal."""
         forward = self.journal.goal is Goal.NEW
-        for entry in self._record(drive.axis).entries:
-            wanted = entry.after if forward else entry.before
-            found = drive.read(entry.info)
-            if not same(entry.info, found, wanted):
+        wanted = {
+            entry.info: entry.after if forward else entry.before
+            for entry in self._record(drive.axis).entries
+        }
+        if not forward:
+            wanted |= {held.info: held.value for held in self.outcomes[drive.axis].written}
+        for info, value in wanted.items():
+            found = drive.read(info)
+            if not same(info, found, value):
                 raise MismatchError(
-                    f"{drive.axis}, {entry.info.name}, object {entry.info.address}: wrote {wanted}, "
-                    f"the drive holds {found}."
+                    f"{drive.axis}, {info.name}, object {info.address}: wrote {value}, the drive "
+                    f"holds {found}."
                 )
 
     def _store(self, drive: ParameterDrive) -> None:
@@ -127,6 +132,7 @@ class Transaction:
         except StoreRefusedError:
             self.journal = self.journal.refused_to_store(drive.axis)
             raise
+        self._check(drive)  # one that had rebooted has stored something else
 
     def _begin(self, step: Step) -> None:
         self._go(self.journal.began(step))
@@ -195,7 +201,8 @@ class Transaction:
                 else:
                     self._store(self._drives[step.axis])
             except DrivesError as error:
-                self.outcomes[step.axis].trouble = str(error)
+                lost = step.action is Action.STORE and isinstance(error, MismatchError)
+                self.outcomes[step.axis].trouble = _LOST if lost else str(error)
                 given_up.add(step.axis)
                 continue
             self._go_quietly(self.journal.ended(step))

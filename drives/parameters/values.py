@@ -56,6 +56,9 @@ class ParameterDrive(Protocol):
     def wait(self, seconds: float) -> None:
         """Let time pass on the drive's bus."""
 
+    def wakes(self, patience: float) -> bool:
+        """Whether it answers within so many seconds."""
+
     def power_state(self) -> PowerState:
         """Power state that the drive shows."""
 

@@ -127,7 +127,7 @@ def test_between_measuring_and_writing(small_bench, monkeypatch, module, name, c
     ``late``: so long after the last motion that nothing polls; the work is broken off at once.
     """
     if late:
-        monkeypatch.setattr(import_module("fieldtool.cli.main"), "ASKED_WITHIN", -1.0)
+        monkeypatch.setattr(import_module("fieldtool.cli.stop_key"), "ASKED_WITHIN", -1.0)
     target = import_module(f"fieldtool.workflow.{module}")
     pressing_during(monkeypatch, target, name, call)
     outcome = small_bench.run("--write", "--yes", "--store")

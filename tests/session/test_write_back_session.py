@@ -4,6 +4,7 @@ import json
 import signal
 from dataclasses import dataclass
 
+import can
 import pytest
 import yaml
 
@@ -231,6 +232,37 @@ def test_a_drive_that_vanishes_while_it_is_written_is_named(session):
     assert outcome.code == 7
     assert "arm (node 12) holds not known values of velocity_p 0x2010:02" in outcome.err
     assert TABLE not in session.changed(), "the other drive was restored"
+
+
+def test_a_drive_that_is_away_for_some_seconds_is_waited_for(session):
+    """A real drive that lost its supply takes its time to boot."""
+
+    def unplug(_value):
+        del node.dictionary.guards[VELOCITY_I]
+        session.inject(NodeVanishes(ARM))
+        session.machine.scheduler.add(4.0, session.machine.lift, (NodeVanishes(ARM),))
+
+    node = session.machine.node(ARM)
+    node.dictionary.guards[VELOCITY_I] = unplug
+    outcome = write(session)
+    assert outcome.code == 6, outcome.err
+    assert session.changed() == {}
+
+
+def test_a_drive_that_somebody_stopped_is_woken_and_restored(session):
+    """A node in NMT stopped answers no SDO."""
+    stop_arm = can.Message(arbitration_id=0, data=[0x02, ARM], is_extended_id=False)
+
+    def stop(_value):
+        del node.dictionary.guards[VELOCITY_I]
+        with can.Bus(interface="fieldsim", channel=session.channel) as other:
+            other.send(stop_arm)
+
+    node = session.machine.node(ARM)
+    node.dictionary.guards[VELOCITY_I] = stop
+    outcome = write(session)
+    assert outcome.code == 6, outcome.err
+    assert session.changed() == {}
 
 
 def test_a_drive_that_reboots_while_it_is_written_holds_old_values_in_the_end(session):

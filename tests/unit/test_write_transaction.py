@@ -113,6 +113,9 @@ class FakeDrive:
     def answers(self):
         return True
 
+    def wakes(self, patience):
+        return True
+
     def wait(self, seconds):
         pass
 
@@ -369,3 +372,44 @@ def _stores_at(count, operation):
         Transaction(world.drives, journal, backup, world.save).write()
     changed = [k for k, drive in enumerate(world.drives) if drive.nvm != before[k]]
     return changed[0] if changed else None
+
+
+class LosesBeforeStoring(FakeDrive):
+    """Loses its supply right before it stores for the time with this number, from 1."""
+
+    number, stores = 1, 0
+
+    def write(self, info, value, timeout=None):
+        if info.address == PROFILE.store.object:
+            self.stores += 1
+            if self.stores == self.number:
+                self.lose_power()
+        super().write(info, value, timeout)
+
+
+@pytest.mark.parametrize("number", [1, 2])
+def test_what_was_stored_counts_only_if_it_was_still_there(number):
+    """A drive that rebooted in between has confirmed that it stored something else.
+
+    1: on the way forward, so all go back; 2: on the way back, after the second drive refused.
+    """
+    world, journal, backup = made(2, Storing.ALL, {})
+    world.drives[0].__class__ = LosesBeforeStoring
+    world.drives[0].number = number
+    if number == 2:
+        world.drives[1].__class__ = type(
+            "Refusing", (FakeDrive,), {"write": _refuse_to_store(FakeDrive.write)}
+        )
+    with pytest.raises(WriteBackError):
+        Transaction(world.drives, journal, backup, world.save).write()
+    assert world.drives[0].stores >= number
+    assert all_hold(world, 0)
+
+
+def _refuse_to_store(write):
+    def refusing(drive, info, value, timeout=None):
+        if info.address == PROFILE.store.object:
+            raise SdoAbortError(drive.axis, info.address.index, 0, REFUSED, "write")
+        write(drive, info, value, timeout)
+
+    return refusing
