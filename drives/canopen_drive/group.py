@@ -9,7 +9,7 @@ from pathlib import Path
 import can
 
 from drives.bus import CyclicLoad, check_cycle, open_bus, shortest_cycle
-from drives.canopen_drive import setup
+from drives.canopen_drive import fail_safe, setup
 from drives.canopen_drive.drive import CanopenDrive
 from drives.canopen_drive.interrupts import uninterrupted
 from drives.canopen_drive.line import Line
@@ -107,6 +107,7 @@ class CanopenGroup:
         """
         for drive in self._drives:
             drive.check_mode(Mode.CYCLIC_POSITION)
+            fail_safe.require_fail_safe(drive)
             if drive.axis_profile.may_float and len(self._drives) > 1:
                 drive.check_mode(Mode.CYCLIC_TORQUE)
         with ExitStack() as stack:
@@ -162,11 +163,13 @@ class CanopenGroup:
             for drive in self._drives:  # last, and so first to be put back
                 changes = setup.TemporaryObjects(drive)
                 stack.callback(self._disarm, changes, drive, unsure)
-                setup.fail_safe(drive, changes)
+                fail_safe.arm(drive, changes)
             for drive in self._drives:
                 stack.callback(self._leave_operational, drive)
             for drive in self._drives:
                 drive.node.nmt.send_command(START_NODE)
+            for drive in self._drives:
+                fail_safe.see_armed(drive)
             sync = self._sync(cycle_time)
             stack.callback(sync.close)
             floating = frozenset(free)
@@ -225,6 +228,7 @@ class CanopenGroup:
                 )
             drive.check_idle()
             drive.check_mode(Mode.CYCLIC_TORQUE if drive.axis in free else Mode.CYCLIC_POSITION)
+            fail_safe.require_fail_safe(drive)
             position = drive.read_position()
             if not low <= position <= high:
                 unit = drive.position_unit

@@ -6,7 +6,6 @@ from drives.canopen_drive.torque_offset import TORQUE_OFFSET
 from drives.cia402 import Mode
 from drives.errors import DrivesError, NotSupportedError, SdoAbortError, SdoTimeoutError
 from drives.objects import ObjectAddress, ObjectInfo, type_bits
-from drives.profile import UNKNOWN
 
 PDO_OFF = 1 << 31
 NO_MODE = 0
@@ -96,45 +95,6 @@ def mode(drive: CanopenDrive, wanted: Mode, changes: TemporaryObjects) -> None:
     before = drive.read_int(objects.MODE)
     changes.note(objects.MODE, before, matters=before != NO_MODE)
     drive.set_mode(wanted)
-
-
-def fail_safe(drive: CanopenDrive, changes: TemporaryObjects) -> None:
-    """Make the drive stop by itself when the host's heartbeat is lost (0x1016, 0x6007, 0x1029).
-
-    A quick stop that would let the axis coast (0x605A = 0) becomes a ramp too.
-
-    Raises
-    ------
-    NotSupportedError
-        If the drive has no heartbeat consumer: then nothing would stop it when the host dies.
-    """
-    if drive.read_optional(objects.CONSUMER_HEARTBEAT) is None:
-        raise NotSupportedError(
-            f"{drive.axis}: the drive has no heartbeat consumer 0x1016, so nothing would stop it when "
-            "the host dies. It may not be moved by this tool."
-        )
-    if drive.read_optional(objects.ABORT_CONNECTION) is None:
-        raise NotSupportedError(
-            f"{drive.axis}: the drive has no abort connection option 0x6007, so what it does when the "
-            "host dies is not known. It may not be moved by this tool."
-        )
-    reaction = drive.profile.heartbeat_reaction
-    if reaction == UNKNOWN:
-        raise NotSupportedError(
-            f"{drive.axis}: drive profile {drive.profile.name} does not know which value of 0x6007 "
-            "makes the drive stop when the host dies (`heartbeat_reaction`), so it may not be moved by "
-            "this tool."
-        )
-    changes.change(objects.ABORT_CONNECTION, reaction)
-    behaviour = drive.profile.error_behaviour
-    if behaviour is not None and drive.read_optional(objects.ERROR_BEHAVIOUR) is not None:
-        changes.change(objects.ERROR_BEHAVIOUR, behaviour)
-    if drive.read_optional(objects.QUICK_STOP_OPTION) == COAST:
-        changes.change(
-            objects.QUICK_STOP_OPTION, QUICK_STOP_RAMP[drive.profile.quick_stop_reaction]
-        )
-    changes.change(objects.PRODUCER_HEARTBEAT, round(DRIVE_HEARTBEAT * 1000))
-    changes.change(objects.CONSUMER_HEARTBEAT, (HOST_NODE_ID << 16) | round(HOST_LOST_AFTER * 1000))
 
 
 def cycle(drive: CanopenDrive, cycle_time: float, changes: TemporaryObjects) -> None:
