@@ -105,12 +105,21 @@ class Lines:
     def __init__(self, process: "subprocess.Popen[str]") -> None:
         self.lines: list[tuple[float, str]] = []
         self._process = process
-        threading.Thread(target=self._read, daemon=True).start()
+        self._thread = threading.Thread(target=self._read, daemon=True)
+        self._thread.start()
 
     def _read(self) -> None:
         assert self._process.stdout is not None
-        for line in self._process.stdout:
-            self.lines.append((time.monotonic(), line.strip()))
+        with self._process.stdout as lines:
+            for line in lines:
+                self.lines.append((time.monotonic(), line.strip()))
+
+    def close(self) -> None:
+        """End the process, and read what it has said."""
+        if self._process.poll() is None:
+            self._process.kill()
+        self._process.wait(10.0)
+        self._thread.join(10.0)
 
     def wait_for(self, words: str, seconds: float = PATIENCE) -> None:
         deadline = time.monotonic() + seconds
@@ -142,13 +151,14 @@ def test_sigkill_in_motion_stops_the_drive_by_its_own_heartbeat_consumer(
             text=True,
         )
 
-    drives = begin(DRIVES, cable.ends[0])
-    master = None
-    try:
-        told = Lines(drives)
+    with contextlib.ExitStack() as stack:
+        told = Lines(begin(DRIVES, cable.ends[0]))
+        stack.callback(told.close)
         told.wait_for("ready")
         master = begin(MASTER, cable.ends[1])
-        Lines(master).wait_for("moving 50")
+        moving = Lines(master)
+        stack.callback(moving.close)
+        moving.wait_for("moving 50")
         killed = time.monotonic()
         master.send_signal(signal.SIGKILL)
         assert master.wait(10.0) == -signal.SIGKILL
@@ -163,8 +173,3 @@ def test_sigkill_in_motion_stops_the_drive_by_its_own_heartbeat_consumer(
         # monotonic clocks of two processes are one; the last heartbeat came before the kill
         assert stopped[0] - killed < HOST_LOST_AFTER + 0.5
         assert states[-1][1] == "SWITCH_ON_DISABLED"
-    finally:
-        for process in (drives, master):
-            if process is not None and process.poll() is None:
-                process.kill()
-                process.wait(10.0)
