@@ -12,8 +12,6 @@ from fieldtool.experiment.multisine.design import (
     MORE_PERIODS,
     PERIODS,
     PILOT_SHARE,
-    SHAPES,
-    Shape,
     experiments_for,
     likely_torques,
     mode_band,
@@ -23,10 +21,12 @@ from fieldtool.experiment.multisine.design import (
 )
 from fieldtool.experiment.multisine.forecast import forecast_multisine, predicted_phasors
 from fieldtool.experiment.multisine.plan import MultisinePlan
+from fieldtool.experiment.multisine.unit_inputs import Shape
 from fieldtool.identify.likelihood.expected import Excitation, Expected, Noise, expected_accuracy
 from fieldtool.identify.multisine.dry_friction import DryFriction
 from fieldtool.identify.multisine.pilot import FRICTION_SEEN
 from fieldtool.records.model import MachineModel
+from fieldtool.workflow.best_spread import BestSpread
 
 SECONDS, SHORTEST_SECONDS, SWINGS = 60.0, 12.0, 125.0
 """Of excitation in all, where nothing else is asked for: so many swings of the slowest mode, in these
@@ -37,6 +37,8 @@ USUAL = 3
 """Multiple that the pilot's period reckons with."""
 ROUND = 0.04
 """Seconds that a pilot's period is a whole number of, so that it is one of all cycle times."""
+PILOT_SHAPE = Shape(-0.75)
+"""Spread of the pilot: the machine as last accepted is not worth a finer one."""
 MARGIN = 2.0
 """Standard errors that the accuracy that is wanted has to cover."""
 
@@ -160,7 +162,7 @@ def plan_pilot(
         setting,
         cycle_time,
         times.pilot_period,
-        SHAPES[0],
+        PILOT_SHAPE,
         seed,
         count=times.pilot_experiments,
         name="pilot",
@@ -205,27 +207,28 @@ def plan_main(
     PlanRefusedError
         If the machine can not be excited within its limits.
     """
-    chosen: tuple[float, float, Shape] | None = None
+    chosen: tuple[float, float, BestSpread] | None = None
     for multiple in MULTIPLES:
         period = multiple * times.pilot_period
         needed = len(setting.loops) * (settle_time(setting.model) + times.periods * period)
         if chosen is not None and needed > times.seconds_left * (1 + 1e-6):
             break
-        for shape in SHAPES:
-            error = wanted.reached(
-                _likely(setting, cycle_time, noise, (period, times.periods), shape, seed, offsets)
-            )
-            if chosen is None or error < chosen[0]:
-                chosen = (error, period, shape)
-        if chosen is not None and chosen[0] <= 1.0 and fine_enough(period, setting.model):
+        samples = times.periods * round(period / cycle_time)
+        spread = BestSpread(noise, samples, vars(wanted))
+        omega, torques = likely_torques(setting, period, spread, seed, offsets=offsets)
+        likely = [Excitation(omega, torque, samples) for torque in torques]
+        error = wanted.reached(expected_accuracy(setting.model, likely, noise))
+        if chosen is None or error < chosen[0]:
+            chosen = (error, period, spread)
+        if chosen[0] <= 1.0 and fine_enough(period, setting.model):
             break
     if chosen is None:
         raise PlanRefusedError(
             f"no period of the fast plan fits into {times.seconds_left:.3g} s: allow more time"
         )
-    _, period, shape = chosen
+    _, period, spread = chosen
     plan = experiments_for(
-        setting, cycle_time, period, shape, seed, offsets=offsets, periods=times.periods
+        setting, cycle_time, period, spread, seed, offsets=offsets, periods=times.periods
     )
     return PlannedFast(
         plan,
@@ -309,18 +312,3 @@ def excitations(plan: MultisinePlan, setting: Setting) -> tuple[Excitation, ...]
         for one in plan.experiments
     )
 
-
-def _likely(
-    setting: Setting,
-    cycle_time: float,
-    noise: Noise,
-    timed: tuple[float, int],
-    shape: Shape,
-    seed: int,
-    offsets: Sequence[bool],
-) -> Expected:
-    period, periods = timed
-    omega, torques = likely_torques(setting, period, shape, seed, offsets=offsets)
-    samples = periods * round(period / cycle_time)
-    experiments = [Excitation(omega, torque, samples) for torque in torques]
-    return expected_accuracy(setting.model, experiments, noise)

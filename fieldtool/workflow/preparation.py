@@ -7,7 +7,7 @@ from drives.parameters import read_loop
 from drives.profile import MachineProfile
 from fieldtool.experiment.axes import Axes
 from fieldtool.experiment.forecast import Setting
-from fieldtool.experiment.multisine.design import smooth
+from fieldtool.experiment.multisine.unit_inputs import smooth
 from fieldtool.frf.held_targets import LINEAR_TARGETS
 from fieldtool.records.closed_loop import loop_from_parameters
 from fieldtool.records.model import MachineModel

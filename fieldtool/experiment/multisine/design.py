@@ -1,13 +1,13 @@
 """Design of the fast plan: which lines, how strong, how long, for one machine and its limits.
 
 All loops stay closed and all axes move at once, so what limits one axis' excitation is what the
-others pass on to it as well.  Amplitudes are chosen so that the torque of every motor is spread over
-the lines by a simple rule, then one factor an axis brings each axis as near to its limits as the
-others, by the prior model.
+others pass on to it as well.  A spread (see ``unit_inputs``) chooses the inputs of all axes at all
+lines so that they just use a share of the limits; the plan is simulated with the model that it rests
+on, and spread anew by the peaks that it really has.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,6 @@ from fieldtool.experiment.forecast import Setting
 from fieldtool.experiment.multisine.forecast import (
     allowed_peaks,
     experiment_peaks,
-    offset_response,
     scaled_to_limits,
 )
 from fieldtool.experiment.multisine.phases import orthogonal_phases
@@ -26,8 +25,9 @@ from fieldtool.experiment.multisine.plan import (
     orthogonal_experiments,
     random_odd_lines,
 )
+from fieldtool.experiment.multisine.unit_inputs import CREST, Spread, unit_inputs
 from fieldtool.experiment.stepped.design import undamped_modes
-from fieldtool.records.closed_loop import AxisLoop, ComplexArray
+from fieldtool.records.closed_loop import ComplexArray
 from fieldtool.records.model import FloatArray, MachineModel
 
 IntArray = NDArray[np.int_]
@@ -53,43 +53,16 @@ SHARE_OF_LIMITS = 0.65
 """Of every limit that the plan may use by the model that it rests on."""
 PILOT_SHARE = 0.2
 """The same for the pilot, which rests on the machine as last accepted."""
-CREST = 2.5
-"""Peak over root mean square that amplitudes reckon with before the plan is simulated."""
-WEAK = 0.35
-"""Of the largest torque at any line that a controller asks for per reference, its axis locked: where
-it is less, behind its filters, a torque offset excites the axis if its drive takes one."""
 BIAS_SHARE = 0.8
 """Of the travel and of the velocity limit that a bias velocity may use."""
 BIAS_MARGIN = 1.2
 """Bias velocity over the excitation's largest velocity."""
 LEAST_FACTOR = 0.1
 """Below it the excitation would be too weak beside what a bias velocity gains."""
-BEYOND, SMOOTH = 8.0, 0.05
-"""A drive takes torque offsets once a cycle.  Their steps must not reach the torque, which is sampled
-at the same rate: at so many times the highest line, below the rate of the cycles, the drive's filters
-may pass so much."""
 LEVELLINGS = 3
-"""Of simulating the plan and scaling each axis' input."""
+"""Of simulating the plan and spreading its inputs anew."""
 ROUNDS = 8
-"""Of bringing the axes' factors to one level."""
-
-
-@dataclass(frozen=True)
-class Shape:
-    """How the torque is spread over the lines: by a power of the frequency."""
-
-    slope: float
-    """0: each line the same; -1: falling with the frequency."""
-
-    def amplitudes(self, omega: FloatArray) -> FloatArray:
-        """Return relative torques, shape (L,)."""
-        middle = float(np.sqrt(omega[0] * omega[-1]))
-        relative: FloatArray = (omega / middle) ** self.slope
-        return relative
-
-
-SHAPES = (Shape(-0.75), Shape(-0.5), Shape(0.0))
-"""To choose from, by the accuracy to expect."""
+"""Of finding the largest excitation beside a bias velocity."""
 
 
 def fast_cycle_times(model: MachineModel, shortest: float) -> tuple[float, ...]:
@@ -149,7 +122,7 @@ def experiments_for(
     setting: Setting,
     cycle_time: float,
     period: float,
-    shape: Shape,
+    spread: Spread,
     seed: int,
     *,
     count: int | None = None,
@@ -166,8 +139,8 @@ def experiments_for(
         Model, loops and limits that the amplitudes rest on.
     cycle_time, period
         Seconds; the period is rounded to whole cycles.
-    shape
-        How the torque is spread.
+    spread
+        How the inputs are spread over axes and lines.
     seed
         Of the random lines and phases.
     count
@@ -188,8 +161,9 @@ def experiments_for(
     """
     samples = max(4, round(period / cycle_time))
     lines, detection = lines_for(setting.model, samples * cycle_time, np.random.default_rng(seed))
-    inputs = _inputs(setting, lines, samples * cycle_time, offsets)
-    size = inputs.sizes(shape, share)
+    inputs = unit_inputs(setting, lines, samples * cycle_time, offsets)
+    crest = np.full((5, inputs.by_torque.shape[1]), CREST)
+    size = spread(inputs, share, crest)
     experiments = orthogonal_experiments(
         lines,
         detection,
@@ -201,25 +175,25 @@ def experiments_for(
         settle=round(settle_time(setting.model) / cycle_time),
         seed=seed,
         name=name,
-        weights=inputs.tightest(size),
+        weights=inputs.tightest(size, crest),
     )
     plan = MultisinePlan(cycle_time, tuple(experiments[:count]), ())
-    return scaled_to_limits(_levelled(plan, setting, share), setting, share)
+    for _ in range(LEVELLINGS):  # by the crest factors that these phases have
+        peaks = (experiment_peaks(plan, setting) / allowed_peaks(setting)).max(axis=0)
+        level = inputs.use(size, np.ones_like(crest))
+        crest = np.where(level > 0, peaks / np.where(level > 0, level, 1.0), crest)
+        new = spread(inputs, share, crest)
+        plan, size = _resized(plan, new / size), new
+    return scaled_to_limits(plan, setting, share)
 
 
-def _levelled(plan: MultisinePlan, setting: Setting, share: float) -> MultisinePlan:
-    """Return the plan with each axis' input scaled until its own peak is at the share of a limit."""
-    for _ in range(LEVELLINGS):
-        use = (experiment_peaks(plan, setting) / allowed_peaks(setting)).max(axis=(0, 1))
-        factor = np.clip(share / use, 0.5, 2.0) ** 0.8
-        plan = replace(
-            plan,
-            experiments=tuple(
-                replace(one, reference=one.reference * factor, torque=one.torque * factor)
-                for one in plan.experiments
-            ),
-        )
-    return plan
+def _resized(plan: MultisinePlan, factor: FloatArray) -> MultisinePlan:
+    """Return the plan with each line of each axis' input multiplied, (L, M)."""
+    experiments = tuple(
+        replace(one, reference=one.reference * factor, torque=one.torque * factor)
+        for one in plan.experiments
+    )
+    return replace(plan, experiments=experiments)
 
 
 def with_bias(
@@ -271,7 +245,7 @@ def with_bias(
 def likely_torques(
     setting: Setting,
     period: float,
-    shape: Shape,
+    spread: Spread,
     seed: int,
     *,
     share: float = SHARE_OF_LIMITS,
@@ -285,103 +259,11 @@ def likely_torques(
         Lines (L,), rad/s, and the motors' torque phasors (L, M) in each of the M experiments.
     """
     lines, _ = lines_for(setting.model, period, np.random.default_rng(seed))
-    inputs = _inputs(setting, lines, period, offsets)
-    size = inputs.sizes(shape, share)
-    mixing = orthogonal_phases(size.shape[1], size.shape[1])
+    inputs = unit_inputs(setting, lines, period, offsets)
+    axes = inputs.by_torque.shape[1]
+    size = spread(inputs, share, np.full((5, axes), CREST))
+    mixing = orthogonal_phases(axes, axes)
     torques = tuple(
-        np.einsum("lij,lj->li", inputs.torque, size * mixing[:, e]) for e in range(size.shape[1])
+        np.einsum("lij,lj->li", inputs.torque, size * mixing[:, e]) for e in range(axes)
     )
     return inputs.omega, torques
-
-
-def smooth(loop: AxisLoop, omega: float) -> bool:
-    """Return whether a drive's filters leave nothing of steps that come at this rate, rad/s."""
-    return abs(loop.torque_shape(1j * omega)) < SMOOTH
-
-
-def _inputs(
-    setting: Setting, lines: NDArray[np.int64], period: float, offsets: Sequence[bool]
-) -> "_Inputs":
-    """Choose how each axis is excited at each line, and what a unit of that does."""
-    loop = setting.closed_loop(())
-    axes = len(setting.loops)
-    offsets = offsets or (False,) * axes
-    omega = (2 * np.pi / period * lines).astype(np.float64)
-    shape = (omega.size, axes, axes)
-    position, torque = np.zeros(shape, np.complex128), np.zeros(shape, np.complex128)
-    by_torque = np.zeros((omega.size, axes), dtype=np.bool_)
-    for k in range(axes):
-        position[:, :, k], torque[:, :, k] = loop.response(omega, k)
-        if offsets[k] and smooth(setting.loops[k], BEYOND * omega[-1]):
-            passed = np.abs([setting.loops[k].gain_of_reference(1j * w) for w in omega])
-            by_torque[:, k] = passed < WEAK * passed.max()
-            unit = np.zeros((omega.size, axes), dtype=np.complex128)
-            unit[:, k] = 1.0
-            moved, pushed = offset_response(loop, omega, unit)
-            there = by_torque[:, k]
-            position[there, :, k], torque[there, :, k] = moved[there], pushed[there]
-    return _Inputs(setting, omega, by_torque, position, torque)
-
-
-@dataclass(frozen=True, eq=False)
-class _Inputs:
-    """What a unit input of each axis does at each line, by the model."""
-
-    setting: Setting
-    omega: FloatArray
-    by_torque: NDArray[np.bool_]
-    """Where the input is a torque offset and not a position reference, (L, M)."""
-    position: ComplexArray
-    """(L, M motors, M inputs)."""
-    torque: ComplexArray
-    """(L, M motors, M inputs)."""
-
-    def sizes(self, shape: Shape, share: float) -> FloatArray:
-        """Return inputs (L, M): torques by the shape, all axes equally near to their limits."""
-        own = np.abs(np.einsum("lkk->lk", self.torque))
-        size: FloatArray = shape.amplitudes(self.omega)[:, None] / own
-        for _ in range(ROUNDS):
-            use = self._use(size).max(axis=0)
-            size = size * np.clip(share / use, 0.25, 4.0) ** 0.7
-        return size
-
-    def tightest(self, size: FloatArray) -> ComplexArray:
-        """Return each axis' output that is nearest to its limit, for a unit input, (L, M, M)."""
-        chosen = self._use(size).argmax(axis=0)
-        outputs = self._outputs()
-        columns = [outputs[q][:, k, :] for k, q in enumerate(chosen)]
-        weights: ComplexArray = np.stack(columns, axis=2)
-        return weights
-
-    def _outputs(self) -> ComplexArray:
-        """All that has a limit, as a share of it, for a unit input: (5, L, M motors, M inputs)."""
-        w = self.omega[:, None, None]
-        limits, centre = self.setting.limits, self.setting.centre
-        room = [
-            min(c - one.travel[0], one.travel[1] - c) for c, one in zip(centre, limits, strict=True)
-        ]
-
-        def of(values: Sequence[float]) -> FloatArray:
-            return np.array(values)[None, :, None]
-
-        reference = np.eye(len(limits)) * ~self.by_torque[:, None, :]
-        outputs: ComplexArray = np.stack(
-            [
-                self.position / of(room),
-                self.position * w / of([one.velocity for one in limits]),
-                self.position * w**2 / of([one.acceleration for one in limits]),
-                self.torque / of([one.torque for one in limits]),
-                (reference - self.position) / of([one.following_error for one in limits]),
-            ]
-        )
-        return outputs
-
-    def _use(self, size: FloatArray) -> FloatArray:
-        """Return the share of each limit that each axis uses, shape (5, M).
-
-        Orthogonal experiments share out each input's power: on average an axis moves by the root
-        sum of squares of what all inputs pass on to it.
-        """
-        power = np.sum(np.abs(self._outputs() * size[None, :, None, :]) ** 2, axis=(1, 3))
-        use: FloatArray = CREST * np.sqrt(power / 2)
-        return use

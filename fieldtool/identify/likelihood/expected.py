@@ -95,46 +95,108 @@ def expected_accuracy(
     if not experiments:
         raise ValueError("an accuracy needs at least one experiment")
     omega = np.unique(np.concatenate([e.omega for e in experiments]))
-    left_out = {"load_friction"}
-    left_out |= set() if fit_delay else {"delay"}
-    left_out |= set() if fit_friction else {"viscous_friction"}
-    parameters = tuple(p for p in machine_parameters(model, omega) if p.kind not in left_out)
-    delays = np.zeros(len(model.axes))
-    values = parameter_values(model, parameters, list(delays))
-    steps = np.array(
-        [v if p.logarithmic and v else p.scale for p, v in zip(parameters, values, strict=True)]
-    )
-    derivatives = response_derivatives(model, omega, delays, parameters) * steps
-    response = machine_response(model, omega)
-    lines = [_line_information(e, omega, derivatives, response, noise) for e in experiments]
+    scaled = _Scaled.of(model, omega, fit_delay, fit_friction)
+    lines = [scaled.information(e, noise) for e in experiments]
     total = np.sum([line.sum(axis=0) for line in lines], axis=0)
     covariance = _inverse(total)
     return Expected(
-        parameters,
-        values,
-        np.sqrt(np.maximum(np.diag(covariance), 0.0)) * np.abs(steps),
+        scaled.parameters,
+        scaled.values,
+        np.sqrt(np.maximum(np.diag(covariance), 0.0)) * np.abs(scaled.steps),
         tuple(_worth(line, covariance) for line in lines),
     )
 
 
-def _line_information(
-    experiment: Excitation,
-    omega: FloatArray,
-    derivatives: ComplexArray,
-    response: ComplexArray,
-    noise: Noise,
-) -> FloatArray:
-    """Information of each line on the scaled parameters, shape (L, P, P)."""
-    place = np.searchsorted(omega, experiment.omega)
-    mean = 4.0 / experiment.samples  # E|2/N sum n exp(-jwt)|**2 of unit noise
-    g = response[place]
-    covariance = (g * noise.torque**2) @ g.conj().transpose(0, 2, 1) + np.diag(noise.position**2)
-    std = np.sqrt(np.einsum("lkk->lk", covariance).real)
-    lower = np.linalg.cholesky(covariance / (std[:, :, None] * std[:, None, :]))
-    moved = np.einsum("lijp,lj->lip", derivatives[place], experiment.torque)
-    white = np.linalg.solve(lower, moved / std[:, :, None]) * np.sqrt(2.0 / mean)
-    information: FloatArray = np.einsum("lip,liq->lpq", white.conj(), white).real
-    return information
+@dataclass(frozen=True, eq=False)
+class InputInformation:
+    """What each input of a unit tells, each alone."""
+
+    parameters: tuple[Parameter, ...]
+    values: FloatArray
+    """Shape (P,), SI."""
+    steps: FloatArray
+    """Shape (P,), SI: the units in which the rows count the parameters."""
+    rows: FloatArray
+    """Shape (L, N, R, P): the information of input n at line l is the sum over R of the products of
+    two columns."""
+
+
+def input_information(
+    model: MachineModel, omega: FloatArray, torque: ComplexArray, samples: int, noise: Noise
+) -> InputInformation:
+    """Return the information of inputs at lines: that of a plan is the sum, each times its power.
+
+    Parameters
+    ----------
+    model
+        The machine as far as it is known.
+    omega
+        Shape (L,), rad/s, rising.
+    torque
+        Phasors of the motors' torques that a unit of input n causes, shape (L, M, N), N m or N, peak.
+    samples
+        That the mean of the periods rests on.
+    noise
+        Of single samples.
+    """
+    scaled = _Scaled.of(model, omega, fit_delay=True, fit_friction=True)
+    white = scaled.white(np.arange(omega.size), torque, samples, noise)
+    rows = np.concatenate([white.real, white.imag], axis=1).transpose(0, 2, 1, 3)
+    return InputInformation(scaled.parameters, scaled.values, scaled.steps, rows)
+
+
+@dataclass(frozen=True, eq=False)
+class _Scaled:
+    """A machine's response at some frequencies, and its derivatives by scaled parameters."""
+
+    omega: FloatArray
+    parameters: tuple[Parameter, ...]
+    values: FloatArray
+    steps: FloatArray
+    response: ComplexArray
+    derivatives: ComplexArray
+    """(F, M, M, P)."""
+
+    @classmethod
+    def of(
+        cls, model: MachineModel, omega: FloatArray, fit_delay: bool, fit_friction: bool
+    ) -> "_Scaled":
+        left_out = {"load_friction"}
+        left_out |= set() if fit_delay else {"delay"}
+        left_out |= set() if fit_friction else {"viscous_friction"}
+        parameters = tuple(p for p in machine_parameters(model, omega) if p.kind not in left_out)
+        delays = np.zeros(len(model.axes))
+        values = parameter_values(model, parameters, list(delays))
+        steps = np.array(
+            [v if p.logarithmic and v else p.scale for p, v in zip(parameters, values, strict=True)]
+        )
+        derivatives = response_derivatives(model, omega, delays, parameters) * steps
+        response = machine_response(model, omega)
+        return cls(omega, parameters, values, steps, response, derivatives)
+
+    def white(
+        self, place: NDArray[np.intp], torque: ComplexArray, samples: int, noise: Noise
+    ) -> ComplexArray:
+        """Derivatives of what torques (R, M, N) move at frequencies, over its noise: (R, M, N, P)."""
+        mean = 4.0 / samples  # E|2/N sum n exp(-jwt)|**2 of unit noise
+        g = self.response[place]
+        covariance = (g * noise.torque**2) @ g.conj().transpose(0, 2, 1) + np.diag(
+            noise.position**2
+        )
+        std = np.sqrt(np.einsum("lkk->lk", covariance).real)
+        lower = np.linalg.cholesky(covariance / (std[:, :, None] * std[:, None, :]))
+        moved = np.einsum("lijp,ljn->linp", self.derivatives[place], torque)
+        rows = (moved / std[:, :, None, None]).reshape(*std.shape, -1)
+        white: ComplexArray = np.linalg.solve(lower, rows) * np.sqrt(2.0 / mean)
+        return white.reshape(moved.shape)
+
+    def information(self, experiment: Excitation, noise: Noise) -> FloatArray:
+        """Information of each line on the scaled parameters, shape (L, P, P)."""
+        place = np.searchsorted(self.omega, experiment.omega)
+        torque = experiment.torque[:, :, None]
+        white = self.white(place, torque, experiment.samples, noise)[:, :, 0, :]
+        information: FloatArray = np.einsum("lip,liq->lpq", white.conj(), white).real
+        return information
 
 
 def _inverse(information: FloatArray) -> FloatArray:

@@ -1,0 +1,90 @@
+"""The inputs that tell most of a machine within limits: a convex design on the information matrix.
+
+The information of a plan is linear in the powers of its inputs, and so is the power with which it
+moves each axis.  Sought are the powers with the least sum over the parameters of (standard error over
+the error that is wanted) squared, with no axis beyond its limits.
+
+Source: Pronzato and Pazman, Design of Experiments in Nonlinear Models, chapter 5 (A-optimal design);
+Mehra, Optimal input signals for parameter estimation in dynamic systems, IEEE Trans. Automatic
+Control 19 (1974) 753.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+FloatArray = NDArray[np.float64]
+KNOWN = 1.0
+"""Information that is there before: each scaled parameter within about its own size."""
+SHARP = 16
+"""The norm of this order of the used shares takes the place of the largest."""
+RANGE = 14.0
+"""Natural logarithm of the largest change of a power from the even start."""
+WORK = 3e10
+"""Multiplications at most."""
+FEWEST_STEPS, MOST_STEPS = 15, 150
+
+
+def best_powers(rows: FloatArray, weights: FloatArray, loads: FloatArray) -> FloatArray:
+    """Return the powers of inputs that tell most.
+
+    Parameters
+    ----------
+    rows
+        Of N inputs, shape (N, R, P): the information of a unit of power of input n on the scaled
+        parameters is the sum over R of the products of two columns.
+    weights
+        One over the wanted standard errors of the scaled parameters, shape (P,); 0 for those that do
+        not count.
+    loads
+        What a unit of power of each input takes of each limit's square, shape (C, N); each input
+        takes something.
+
+    Returns
+    -------
+    ndarray
+        Shape (N,), with the largest of ``loads @ powers`` equal to 1.
+    """
+    N, R, P = rows.shape
+    flat = rows.reshape(N * R, P)
+    weight2 = weights**2
+    largest = loads.max(axis=0)
+
+    def powers(x: FloatArray) -> tuple[FloatArray, FloatArray, float]:
+        """Powers within the limits, what they use by a smooth maximum, and that maximum."""
+        free = np.exp(x)
+        use = loads @ free
+        top = float(use.max())
+        level = top * float(np.sum((use / top) ** SHARP)) ** (1 / SHARP)
+        return free / level, use / level, level
+
+    def error(x: FloatArray) -> tuple[float, FloatArray]:
+        p, use, _ = powers(x)
+        covariance = _covariance(flat * np.sqrt(np.repeat(p, R))[:, None])
+        value = float(np.sum(weight2 * np.diag(covariance)))
+        seen = (flat @ (covariance * weights)).reshape(N, -1)
+        slope = -np.einsum("nq,nq->n", seen, seen) * p / value
+        pressed = (use ** (SHARP - 1) @ loads) * p
+        return np.log(value), slope - np.sum(slope) * pressed
+
+    start = -np.log(N * largest)
+    steps = int(np.clip(WORK / (2.0 * N * R * P * P), FEWEST_STEPS, MOST_STEPS))
+    found = minimize(
+        error,
+        start,
+        jac=True,
+        method="L-BFGS-B",
+        bounds=[(v - RANGE, v + RANGE) for v in start],
+        options={"maxiter": steps, "maxcor": 20},
+    )
+    p, use, _ = powers(found.x)
+    result: FloatArray = p / use.max()
+    return result
+
+
+def _covariance(rows: FloatArray) -> FloatArray:
+    """Inverse of the information of rows (., P), with that which is there before."""
+    information = rows.T @ rows + KNOWN * np.eye(rows.shape[1])
+    scale = np.sqrt(np.diag(information))
+    inverse: FloatArray = np.linalg.inv(information / np.outer(scale, scale))
+    return inverse / np.outer(scale, scale)
