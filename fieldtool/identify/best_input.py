@@ -82,9 +82,17 @@ def best_powers(rows: FloatArray, weights: FloatArray, loads: FloatArray) -> Flo
     return result
 
 
+def weighted_error(rows: FloatArray, weights: FloatArray, powers: FloatArray) -> float:
+    """Return what :func:`best_powers` makes small, for inputs of these powers, (N,)."""
+    N, R, P = rows.shape
+    covariance = _covariance((rows * np.sqrt(powers)[:, None, None]).reshape(N * R, P))
+    return float(np.sum(weights**2 * np.diag(covariance)))
+
+
 def _covariance(rows: FloatArray) -> FloatArray:
     """Inverse of the information of rows (., P), with that which is there before."""
     information = rows.T @ rows + KNOWN * np.eye(rows.shape[1])
     scale = np.sqrt(np.diag(information))
     inverse: FloatArray = np.linalg.inv(information / np.outer(scale, scale))
-    return inverse / np.outer(scale, scale)
+    covariance: FloatArray = inverse / np.outer(scale, scale)
+    return covariance

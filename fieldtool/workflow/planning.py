@@ -17,10 +17,11 @@ from fieldtool.experiment.multisine.design import (
     mode_band,
     settle_time,
     shortest_period,
+    telling_lines,
     with_bias,
 )
 from fieldtool.experiment.multisine.forecast import forecast_multisine, predicted_phasors
-from fieldtool.experiment.multisine.plan import MultisinePlan
+from fieldtool.experiment.multisine.plan import Lines, MultisinePlan
 from fieldtool.experiment.multisine.unit_inputs import Shape
 from fieldtool.identify.likelihood.expected import Excitation, Expected, Noise, expected_accuracy
 from fieldtool.identify.multisine.dry_friction import DryFriction
@@ -207,7 +208,7 @@ def plan_main(
     PlanRefusedError
         If the machine can not be excited within its limits.
     """
-    chosen: tuple[float, float, BestSpread] | None = None
+    chosen: tuple[float, float, BestSpread, Lines] | None = None
     for multiple in MULTIPLES:
         period = multiple * times.pilot_period
         needed = len(setting.loops) * (settle_time(setting.model) + times.periods * period)
@@ -215,20 +216,28 @@ def plan_main(
             break
         samples = times.periods * round(period / cycle_time)
         spread = BestSpread(noise, samples, vars(wanted))
-        omega, torques = likely_torques(setting, period, spread, seed, offsets=offsets)
+        lines = telling_lines(setting, period, spread, offsets)
+        omega, torques = likely_torques(setting, period, spread, lines, offsets=offsets)
         likely = [Excitation(omega, torque, samples) for torque in torques]
         error = wanted.reached(expected_accuracy(setting.model, likely, noise))
         if chosen is None or error < chosen[0]:
-            chosen = (error, period, spread)
+            chosen = (error, period, spread, lines)
         if chosen[0] <= 1.0 and fine_enough(period, setting.model):
             break
     if chosen is None:
         raise PlanRefusedError(
             f"no period of the fast plan fits into {times.seconds_left:.3g} s: allow more time"
         )
-    _, period, spread = chosen
+    _, period, spread, lines = chosen
     plan = experiments_for(
-        setting, cycle_time, period, spread, seed, offsets=offsets, periods=times.periods
+        setting,
+        cycle_time,
+        period,
+        spread,
+        seed,
+        offsets=offsets,
+        periods=times.periods,
+        lines=lines,
     )
     return PlannedFast(
         plan,
@@ -311,4 +320,3 @@ def excitations(plan: MultisinePlan, setting: Setting) -> tuple[Excitation, ...]
         )
         for one in plan.experiments
     )
-

@@ -9,13 +9,13 @@ from drives.api import AxisLimits
 from fieldtool.errors import PlanRefusedError
 from fieldtool.experiment.forecast import Setting
 from fieldtool.experiment.multisine.design import (
-    SHAPES,
     experiments_for,
     fast_cycle_times,
     mode_band,
     with_bias,
 )
 from fieldtool.experiment.multisine.plan import MultisineExperiment
+from fieldtool.experiment.multisine.unit_inputs import Shape
 from fieldtool.identify.likelihood.expected import Noise
 from fieldtool.identify.multisine.dry_friction import DryFriction
 from fieldtool.records.closed_loop import AxisLoop, Biquad
@@ -61,7 +61,7 @@ def simulated(one: MultisineExperiment, where: Setting) -> tuple[np.ndarray, np.
 def test_every_axis_comes_near_to_a_limit_and_none_passes_it() -> None:
     where = setting()
     plan = experiments_for(
-        where, CYCLE, 1.6, SHAPES[0], seed=int(np.random.default_rng().integers(99))
+        where, CYCLE, 1.6, Shape(-0.75), seed=int(np.random.default_rng().integers(99))
     )
     largest = np.zeros(2)
     for one in plan.experiments:
@@ -83,7 +83,7 @@ def test_every_axis_comes_near_to_a_limit_and_none_passes_it() -> None:
 def test_lines_cover_the_modes_and_are_odd() -> None:
     where = setting()
     low, high = mode_band(where.model)
-    plan = experiments_for(where, CYCLE, 2.0, SHAPES[1], seed=3)
+    plan = experiments_for(where, CYCLE, 2.0, Shape(-0.5), seed=3)
     f = plan.frequencies
     assert f[0] < 0.5 * low
     assert f[-1] > 1.4 * high
@@ -97,7 +97,7 @@ def test_behind_a_low_pass_torque_offsets_excite() -> None:
     dull = setting()
     slow = AxisLoop(1.5, 0.15, 0.1, 0.0, 0.0, (Biquad.low_pass(10.0, 0.7),))
     dull = replace(dull, loops=(slow, slow))
-    plan = experiments_for(dull, CYCLE, 2.0, SHAPES[0], seed=3, offsets=(True, False))
+    plan = experiments_for(dull, CYCLE, 2.0, Shape(-0.75), seed=3, offsets=(True, False))
     one = plan.experiments[0]
     assert np.any(one.torque[:, 0])
     assert not np.any(one.torque[:, 1])
@@ -155,12 +155,12 @@ def test_an_unstable_loop_is_refused() -> None:
     where = setting()
     wild = replace(where.loops[0], filters=(Biquad.low_pass(6.0, 0.7),))
     with pytest.raises(PlanRefusedError, match="not stable"):
-        experiments_for(replace(where, loops=(wild, wild)), CYCLE, 1.6, SHAPES[0], seed=1)
+        experiments_for(replace(where, loops=(wild, wild)), CYCLE, 1.6, Shape(-0.75), seed=1)
 
 
 def test_with_a_bias_velocity_an_axis_never_reverses() -> None:
     where = setting(travel=20.0)
-    plan = experiments_for(where, CYCLE, 1.6, SHAPES[0], seed=4)
+    plan = experiments_for(where, CYCLE, 1.6, Shape(-0.75), seed=4)
     found = with_bias(plan, where, (0,))
     assert found is not None
     biased, factor = found
@@ -176,7 +176,7 @@ def test_with_a_bias_velocity_an_axis_never_reverses() -> None:
 
 def test_short_travel_leaves_no_bias() -> None:
     where = setting(travel=0.4)
-    plan = experiments_for(where, CYCLE, 1.6, SHAPES[0], seed=4)
+    plan = experiments_for(where, CYCLE, 1.6, Shape(-0.75), seed=4)
     assert with_bias(plan, where, (0,)) is None
 
 

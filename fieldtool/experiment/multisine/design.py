@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fieldtool.errors import PlanRefusedError
 from fieldtool.experiment.forecast import Setting
@@ -21,7 +20,9 @@ from fieldtool.experiment.multisine.forecast import (
 )
 from fieldtool.experiment.multisine.phases import orthogonal_phases
 from fieldtool.experiment.multisine.plan import (
+    Lines,
     MultisinePlan,
+    least_needed_out,
     orthogonal_experiments,
     random_odd_lines,
 )
@@ -30,7 +31,6 @@ from fieldtool.experiment.stepped.design import undamped_modes
 from fieldtool.records.closed_loop import ComplexArray
 from fieldtool.records.model import FloatArray, MachineModel
 
-IntArray = NDArray[np.int_]
 CYCLE_TIMES = (0.001, 0.002, 0.004, 0.005, 0.008, 0.01)
 """Cycle times to choose from, seconds; the shortest that fits, because every sample counts."""
 CYCLES_A_PERIOD = 10
@@ -54,11 +54,13 @@ SHARE_OF_LIMITS = 0.65
 PILOT_SHARE = 0.2
 """The same for the pilot, which rests on the machine as last accepted."""
 BIAS_SHARE = 0.8
-"""Of the travel and of the velocity limit that a bias velocity may use."""
+"""Of the limits that an excitation with a bias velocity may use."""
 BIAS_MARGIN = 1.2
 """Bias velocity over the excitation's largest velocity."""
 LEAST_FACTOR = 0.1
 """Below it the excitation would be too weak beside what a bias velocity gains."""
+PHASINGS = 2
+"""Of choosing phases for the outputs that are near to a limit."""
 LEVELLINGS = 3
 """Of simulating the plan and spreading its inputs anew."""
 ROUNDS = 8
@@ -108,14 +110,33 @@ def shortest_period(model: MachineModel) -> float:
     return max(2 * (FEWEST_LINES - 1) / (HIGH * high - LOW * low), 1 / (2 * low))
 
 
-def lines_for(
-    model: MachineModel, period: float, rng: np.random.Generator
-) -> tuple[IntArray, IntArray]:
+def lines_for(model: MachineModel, period: float, rng: np.random.Generator) -> Lines:
     """Return excited odd lines, and odd lines left out, over the band of a machine's modes."""
+    return random_odd_lines(*_band(model, period), DETECTION_SHARE, rng)
+
+
+def telling_lines(
+    setting: Setting, period: float, spread: Spread, offsets: Sequence[bool] = ()
+) -> Lines:
+    """Return excited odd lines, and odd lines left out: of each group the one that is needed least.
+
+    Where a spread puts its power depends on what it is after; the line of a group with the least
+    power is left out.
+    """
+    first, last = _band(setting.model, period)
+    odd = np.arange(first, last + 1, 2, dtype=np.int_)
+    inputs = unit_inputs(setting, odd, period, offsets)
+    size = spread(inputs).sizes(SHARE_OF_LIMITS, np.full((5, len(setting.loops)), CREST))
+    taken = np.einsum("qlij,lj->l", inputs.power, size**2)
+    return least_needed_out(odd, taken, DETECTION_SHARE)
+
+
+def _band(model: MachineModel, period: float) -> tuple[int, int]:
+    """First and last odd line of the band of a machine's modes."""
     low, high = mode_band(model)
     first = max(1, int(np.floor(LOW * low * period)) | 1)
     last = int(np.ceil(HIGH * high * period)) | 1
-    return random_odd_lines(first, max(last, first + 2 * (FEWEST_LINES - 1)), DETECTION_SHARE, rng)
+    return first, max(last, first + 2 * (FEWEST_LINES - 1))
 
 
 def experiments_for(
@@ -130,6 +151,7 @@ def experiments_for(
     share: float = SHARE_OF_LIMITS,
     offsets: Sequence[bool] = (),
     periods: int = PERIODS,
+    lines: Lines | None = None,
 ) -> MultisinePlan:
     """Return orthogonal experiments that use this share of the limits.
 
@@ -153,6 +175,8 @@ def experiments_for(
         Which axes' drives take a torque offset; none without.
     periods
         Whole periods of each experiment.
+    lines
+        Excited ones and those left out; random ones without.
 
     Raises
     ------
@@ -160,31 +184,39 @@ def experiments_for(
         If the loops are not stable by the model, or nothing fits the limits.
     """
     samples = max(4, round(period / cycle_time))
-    lines, detection = lines_for(setting.model, samples * cycle_time, np.random.default_rng(seed))
-    inputs = unit_inputs(setting, lines, samples * cycle_time, offsets)
-    crest = np.full((5, inputs.by_torque.shape[1]), CREST)
-    size = spread(inputs, share, crest)
-    experiments = orthogonal_experiments(
-        lines,
-        detection,
-        np.where(inputs.by_torque, 0.0, size),
-        torque=np.where(inputs.by_torque, size, 0.0).astype(np.complex128),
-        cycle_time=cycle_time,
-        samples=samples,
-        periods=periods,
-        settle=round(settle_time(setting.model) / cycle_time),
-        seed=seed,
-        name=name,
-        weights=inputs.tightest(size, crest),
+    excited, detection = lines or lines_for(
+        setting.model, samples * cycle_time, np.random.default_rng(seed)
     )
-    plan = MultisinePlan(cycle_time, tuple(experiments[:count]), ())
-    for _ in range(LEVELLINGS):  # by the crest factors that these phases have
-        peaks = (experiment_peaks(plan, setting) / allowed_peaks(setting)).max(axis=0)
-        level = inputs.use(size, np.ones_like(crest))
-        crest = np.where(level > 0, peaks / np.where(level > 0, level, 1.0), crest)
-        new = spread(inputs, share, crest)
-        plan, size = _resized(plan, new / size), new
-    return scaled_to_limits(plan, setting, share)
+    inputs = unit_inputs(setting, excited, samples * cycle_time, offsets)
+    spreading = spread(inputs)
+    crest = np.full((5, inputs.by_torque.shape[1]), CREST)
+    size = spreading.sizes(share, crest)
+    found: list[tuple[float, MultisinePlan]] = []
+    for _ in range(PHASINGS):
+        experiments = orthogonal_experiments(
+            excited,
+            detection,
+            np.where(inputs.by_torque, 0.0, size),
+            torque=np.where(inputs.by_torque, size, 0.0).astype(np.complex128),
+            cycle_time=cycle_time,
+            samples=samples,
+            periods=periods,
+            settle=round(settle_time(setting.model) / cycle_time),
+            seed=seed,
+            name=name,
+            weights=inputs.tightest(size, crest),
+        )
+        plan = MultisinePlan(cycle_time, tuple(experiments[:count]), ())
+        for _ in range(LEVELLINGS):  # by the crest factors that these phases have
+            use = (experiment_peaks(plan, setting) / allowed_peaks(setting)).max(axis=0)
+            fitting = share / float(use.max())
+            found.append((spreading.loss(fitting * size), plan.scaled(fitting)))
+            level = inputs.use(size, np.ones_like(crest))
+            there = level > 0
+            crest[there] = np.sqrt(crest[there] * use[there] / level[there])
+            new = spreading.sizes(share, crest)
+            plan, size = _resized(plan, new / size), new
+    return scaled_to_limits(min(found, key=lambda one: one[0])[1], setting, share)
 
 
 def _resized(plan: MultisinePlan, factor: FloatArray) -> MultisinePlan:
@@ -232,21 +264,33 @@ def with_bias(
         factor = float(min(1.0, np.min(highest / (BIAS_MARGIN * peaks[1][chosen]))))
         if factor < LEAST_FACTOR:
             return None
-    bias = np.zeros(len(setting.loops))
-    bias[chosen] = BIAS_MARGIN * factor * peaks[1][chosen]
+    biased = _biased(plan, factor, peaks[1], chosen)
+    use = float((experiment_peaks(biased, setting) / allowed_peaks(setting)).max())
+    if use > BIAS_SHARE:  # of following error or torque: all of them grow with the factor
+        factor *= BIAS_SHARE / use
+        biased = _biased(plan, factor, peaks[1], chosen)
+    return (biased, factor) if factor >= LEAST_FACTOR else None
+
+
+def _biased(
+    plan: MultisinePlan, factor: float, fastest: FloatArray, axes: Sequence[int]
+) -> MultisinePlan:
+    """Return the plan times a factor, with the bias velocities that it needs on these axes."""
+    bias = np.zeros(fastest.size)
+    bias[axes] = BIAS_MARGIN * factor * fastest[axes]
     signs = (1, -1)  # to and fro, so that the axis ends about where it began
     experiments = tuple(
         replace(one.scaled(factor), bias=signs[k % 2] * bias)
         for k, one in enumerate(plan.experiments)
     )
-    return replace(plan, experiments=experiments), factor
+    return replace(plan, experiments=experiments)
 
 
 def likely_torques(
     setting: Setting,
     period: float,
     spread: Spread,
-    seed: int,
+    lines: Lines,
     *,
     share: float = SHARE_OF_LIMITS,
     offsets: Sequence[bool] = (),
@@ -258,10 +302,9 @@ def likely_torques(
     omega, torques
         Lines (L,), rad/s, and the motors' torque phasors (L, M) in each of the M experiments.
     """
-    lines, _ = lines_for(setting.model, period, np.random.default_rng(seed))
-    inputs = unit_inputs(setting, lines, period, offsets)
+    inputs = unit_inputs(setting, lines[0], period, offsets)
     axes = inputs.by_torque.shape[1]
-    size = spread(inputs, share, np.full((5, axes), CREST))
+    size = spread(inputs).sizes(share, np.full((5, axes), CREST))
     mixing = orthogonal_phases(axes, axes)
     torques = tuple(
         np.einsum("lij,lj->li", inputs.torque, size * mixing[:, e]) for e in range(axes)

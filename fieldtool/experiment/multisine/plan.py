@@ -4,6 +4,7 @@ Nothing here knows a drive.  Source: Pintelon and Schoukens, System Identificati
 (odd random-phase multisines with detection lines); how experiments are orthogonal stands in ``phases``.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import groupby
 
@@ -14,6 +15,8 @@ from fieldtool.experiment.multisine.phases import low_crest, orthogonal_phases
 from fieldtool.records.closed_loop import ComplexArray
 from fieldtool.records.model import FloatArray
 
+Lines = tuple[IntArray, IntArray]
+"""Numbers of the excited lines, (L,), and of those left out, (D,)."""
 SHORTEST_SETTLE = 16
 """Cycles of run-in at least: below, the start is a jolt."""
 
@@ -218,7 +221,7 @@ def streams(
 
 def random_odd_lines(
     first: int, last: int, detection_share: float, rng: np.random.Generator
-) -> tuple[IntArray, IntArray]:
+) -> Lines:
     """Return the odd lines of a band, one at random of each group of them left out.
 
     Parameters
@@ -246,16 +249,27 @@ def random_odd_lines(
     A quadratic non-linearity shows at even lines, a cubic one at the odd lines left out (Pintelon
     and Schoukens, section 4.3).
     """
-    if not 0 <= detection_share <= 0.5:
-        raise ValueError(f"detection share must be 0 to 0.5, got {detection_share:g}")
     odd = np.arange(max(first, 1) | 1, last + 1, 2, dtype=np.int_)
     if odd.size == 0:
         raise ValueError(f"no odd line from {first} to {last}")
+    return _parted(odd, detection_share, lambda group: int(rng.integers(0, group.size)))
+
+
+def least_needed_out(odd: IntArray, need: FloatArray, detection_share: float) -> Lines:
+    """Part odd lines as :func:`random_odd_lines`, but leave out those with the least need, (L,)."""
+    return _parted(odd, detection_share, lambda group: int(np.argmin(need[group])))
+
+
+def _parted(odd: IntArray, detection_share: float, choose: Callable[[IntArray], int]) -> Lines:
+    """Leave out one line of each group; what it chooses from are the places of a group."""
+    if not 0 <= detection_share <= 0.5:
+        raise ValueError(f"detection share must be 0 to 0.5, got {detection_share:g}")
     if detection_share == 0:
         return odd, np.empty(0, dtype=np.int_)
-    group = round(1 / detection_share)
-    begins = np.arange(0, odd.size - group + 1, group)
-    detection = odd[begins + rng.integers(0, group, begins.size)]
+    size = round(1 / detection_share)
+    groups = np.arange(odd.size // size * size).reshape(-1, size)
+    left_out = np.array([group[choose(group)] for group in groups], dtype=np.intp)
+    detection = odd[left_out]
     return np.setdiff1d(odd, detection), detection
 
 

@@ -7,6 +7,7 @@ offset.  All loops are closed, so each input moves all axes, and each takes its 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +26,8 @@ BEYOND, SMOOTH = 8.0, 0.05
 """A drive takes torque offsets once a cycle.  Their steps must not reach the torque, which is sampled
 at the same rate: at so many times the highest line, below the rate of the cycles, the drive's filters
 may pass so much."""
+TIGHT = 0.7
+"""Of the use of the nearest limit, from which an output must not have peaks."""
 ROUNDS = 8
 """Of bringing the axes' factors to one level."""
 
@@ -55,7 +58,8 @@ class UnitInputs:
             self.torque,
             reference - self.position,
         ]
-        shares: ComplexArray = np.stack(moved) / allowed_peaks(self.setting)[:, None, :, None]
+        allowed = allowed_peaks(self.setting)[:, None, :, None]
+        shares: ComplexArray = (np.stack(moved) / allowed).astype(np.complex128)
         return shares
 
     def use(self, size: FloatArray, crest: FloatArray) -> FloatArray:
@@ -77,19 +81,32 @@ class UnitInputs:
     @cached_property
     def power(self) -> FloatArray:
         """Mean square share of each limit for a unit input, shape (5, L, M motors, M inputs)."""
-        power: FloatArray = np.abs(self.outputs) ** 2 / 2
+        power: FloatArray = (np.abs(self.outputs) ** 2 / 2).astype(np.float64)
         return power
 
     def tightest(self, size: FloatArray, crest: FloatArray) -> ComplexArray:
-        """Return each axis' output that is nearest to its limit, for a unit input, (L, M, M)."""
-        chosen = self.use(size, crest).argmax(axis=0)
-        columns = [self.outputs[q][:, k, :] for k, q in enumerate(chosen)]
+        """Return the outputs that are near to a limit, for a unit input, (L, M, Q).
+
+        For each axis that which is nearest, and all others within TIGHT of the nearest of all.
+        """
+        use = self.use(size, crest)
+        near = (use >= TIGHT * use.max()) | (use == use.max(axis=0))
+        columns = [self.outputs[q][:, k, :] for q, k in zip(*np.nonzero(near), strict=True)]
         weights: ComplexArray = np.stack(columns, axis=2)
         return weights
 
 
-Spread = Callable[[UnitInputs, float, FloatArray], FloatArray]
-"""Chooses inputs (L, M), peak, from unit inputs, the share of the limits, and crest factors (5, M)."""
+class Spreading(Protocol):
+    """How some unit inputs are spread over lines and axes."""
+
+    def sizes(self, share: float, crest: FloatArray) -> FloatArray:
+        """Return inputs (L, M), peak, that use a share of the limits with crest factors (5, M)."""
+
+    def loss(self, size: FloatArray) -> float:
+        """Return how bad inputs are, (L, M): of two that fit the limits, take the one with less."""
+
+
+Spread = Callable[[UnitInputs], Spreading]
 
 
 @dataclass(frozen=True)
@@ -99,16 +116,28 @@ class Shape:
     slope: float
     """0: each line the same; -1: falling with the frequency."""
 
-    def __call__(self, inputs: UnitInputs, share: float, crest: FloatArray) -> FloatArray:
-        """Return inputs, peak, shape (L, M)."""
-        omega = inputs.omega
-        own = np.abs(np.einsum("lkk->lk", inputs.torque))
+    def __call__(self, inputs: UnitInputs) -> Spreading:
+        """Return the spreading of some inputs."""
+        return _Shaped(inputs, self.slope)
+
+
+@dataclass(frozen=True, eq=False)
+class _Shaped:
+    inputs: UnitInputs
+    slope: float
+
+    def sizes(self, share: float, crest: FloatArray) -> FloatArray:
+        omega = self.inputs.omega
+        own = np.abs(np.einsum("lkk->lk", self.inputs.torque))
         relative = (omega / np.sqrt(omega[0] * omega[-1])) ** self.slope
         size: FloatArray = relative[:, None] / own
         for _ in range(ROUNDS):
-            use = inputs.use(size, crest).max(axis=0)
+            use = self.inputs.use(size, crest).max(axis=0)
             size = size * np.clip(share / use, 0.25, 4.0) ** 0.7
         return size
+
+    def loss(self, size: FloatArray) -> float:
+        return -float(np.sum(np.log(np.linalg.norm(size, axis=0))))
 
 
 def unit_inputs(
