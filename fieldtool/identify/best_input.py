@@ -9,6 +9,8 @@ Mehra, Optimal input signals for parameter estimation in dynamic systems, IEEE T
 Control 19 (1974) 753.
 """
 
+from functools import partial
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
@@ -16,12 +18,12 @@ from scipy.optimize import minimize
 FloatArray = NDArray[np.float64]
 KNOWN = 1.0
 """Information that is there before: each scaled parameter within about its own size."""
-SHARP = 16
-"""The norm of this order of the used shares takes the place of the largest."""
+SHARP = (16, 80)
+"""The norm of such order of the used shares takes the place of the largest; one after the other."""
 RANGE = 14.0
 """Natural logarithm of the largest change of a power from the even start."""
-WORK = 3e10
-"""Multiplications at most."""
+WORK = 1.5e10
+"""Multiplications at most, for each order of the norm."""
 FEWEST_STEPS, MOST_STEPS = 15, 150
 
 
@@ -50,36 +52,38 @@ def best_powers(rows: FloatArray, weights: FloatArray, loads: FloatArray) -> Flo
     weight2 = weights**2
     largest = loads.max(axis=0)
 
-    def powers(x: FloatArray) -> tuple[FloatArray, FloatArray, float]:
-        """Powers within the limits, what they use by a smooth maximum, and that maximum."""
+    def error(x: FloatArray, sharp: int) -> tuple[float, FloatArray]:
+        """Logarithm of what is made small, powers scaled to the limits, and its slope."""
         free = np.exp(x)
         use = loads @ free
         top = float(use.max())
-        level = top * float(np.sum((use / top) ** SHARP)) ** (1 / SHARP)
-        return free / level, use / level, level
-
-    def error(x: FloatArray) -> tuple[float, FloatArray]:
-        p, use, _ = powers(x)
+        level = top * float(np.sum((use / top) ** sharp)) ** (1 / sharp)
+        p, use = free / level, use / level
         covariance = _covariance(flat * np.sqrt(np.repeat(p, R))[:, None])
         value = float(np.sum(weight2 * np.diag(covariance)))
         seen = (flat @ (covariance * weights)).reshape(N, -1)
         slope = -np.einsum("nq,nq->n", seen, seen) * p / value
-        pressed = (use ** (SHARP - 1) @ loads) * p
+        pressed = (use ** (sharp - 1) @ loads) * p
         return np.log(value), slope - np.sum(slope) * pressed
 
     start = -np.log(N * largest)
+    bounds = [(v - RANGE, v + RANGE) for v in start]
     steps = int(np.clip(WORK / (2.0 * N * R * P * P), FEWEST_STEPS, MOST_STEPS))
-    found = minimize(
-        error,
-        start,
-        jac=True,
-        method="L-BFGS-B",
-        bounds=[(v - RANGE, v + RANGE) for v in start],
-        options={"maxiter": steps, "maxcor": 20},
-    )
-    p, use, _ = powers(found.x)
-    result: FloatArray = p / use.max()
-    return result
+    options = {"maxiter": steps, "maxcor": 20}
+    x = start
+    for sharp in SHARP:
+        found = minimize(
+            partial(error, sharp=sharp),
+            x,
+            jac=True,
+            method="L-BFGS-B",
+            bounds=bounds,
+            options=options,
+        )
+        x = found.x
+    powers: FloatArray = np.exp(x)
+    within: FloatArray = powers / float(np.max(loads @ powers))
+    return within
 
 
 def weighted_error(rows: FloatArray, weights: FloatArray, powers: FloatArray) -> float:
