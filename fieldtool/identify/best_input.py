@@ -69,7 +69,6 @@ def best_powers(rows: FloatArray, weights: FloatArray, loads: FloatArray) -> Flo
     start = -np.log(N * largest)
     bounds = [(v - RANGE, v + RANGE) for v in start]
     steps = int(np.clip(WORK / (2.0 * N * R * P * P), FEWEST_STEPS, MOST_STEPS))
-    options = {"maxiter": steps, "maxcor": 20}
     x = start
     for sharp in SHARP:
         found = minimize(
@@ -78,7 +77,7 @@ def best_powers(rows: FloatArray, weights: FloatArray, loads: FloatArray) -> Flo
             jac=True,
             method="L-BFGS-B",
             bounds=bounds,
-            options=options,
+            options={"maxiter": steps, "maxcor": 20},
         )
         x = found.x
     powers: FloatArray = np.exp(x)

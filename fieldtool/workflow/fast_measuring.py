@@ -44,7 +44,7 @@ LATE_SHARE = 0.01
 """Of the pilot's cycles that may begin late; with more, the next longer cycle is tried."""
 FOLLOWING_ERROR = 4
 """Among an experiment's peaks."""
-SEED = 20
+SEED = 22
 """Of the random phases: the same machine gets the same plan."""
 
 
