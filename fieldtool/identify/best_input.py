@@ -20,7 +20,7 @@ KNOWN = 1.0
 """Information that is there before: each scaled parameter within about its own size."""
 SHARP = (16, 80)
 """The norm of such order of the used shares takes the place of the largest; one after the other."""
-RANGE = 14.0
+RANGE = 7.0
 """Natural logarithm of the largest change of a power from the even start."""
 WORK = 1.5e10
 """Multiplications at most, for each order of the norm."""
@@ -49,7 +49,6 @@ def best_powers(rows: FloatArray, weights: FloatArray, loads: FloatArray) -> Flo
     """
     N, R, P = rows.shape
     flat = rows.reshape(N * R, P)
-    weight2 = weights**2
     largest = loads.max(axis=0)
 
     def error(x: FloatArray, sharp: int) -> tuple[float, FloatArray]:
@@ -60,8 +59,9 @@ def best_powers(rows: FloatArray, weights: FloatArray, loads: FloatArray) -> Flo
         level = top * float(np.sum((use / top) ** sharp)) ** (1 / sharp)
         p, use = free / level, use / level
         covariance = _covariance(flat * np.sqrt(np.repeat(p, R))[:, None])
-        value = float(np.sum(weight2 * np.diag(covariance)))
-        seen = (flat @ (covariance * weights)).reshape(N, -1)
+        std = np.sqrt(np.diag(covariance))
+        value = float(np.sum(weights * std))
+        seen = (flat @ (covariance * np.sqrt(0.5 * weights / std))).reshape(N, -1)
         slope = -np.einsum("nq,nq->n", seen, seen) * p / value
         pressed = (use ** (sharp - 1) @ loads) * p
         return np.log(value), slope - np.sum(slope) * pressed
@@ -89,7 +89,7 @@ def weighted_error(rows: FloatArray, weights: FloatArray, powers: FloatArray) ->
     """Return what :func:`best_powers` makes small, for inputs of these powers, (N,)."""
     N, R, P = rows.shape
     covariance = _covariance((rows * np.sqrt(powers)[:, None, None]).reshape(N * R, P))
-    return float(np.sum(weights**2 * np.diag(covariance)))
+    return float(np.sum(weights * np.sqrt(np.diag(covariance))))
 
 
 def _covariance(rows: FloatArray) -> FloatArray:

@@ -18,7 +18,7 @@ wrong, says that it tells nothing."""
 
 @dataclass(frozen=True, eq=False)
 class BestSpread:
-    """Least sum over the parameters of expected error over wanted error, squared."""
+    """Least sum over the parameters of expected error over wanted error."""
 
     noise: Noise
     samples: int
@@ -61,6 +61,6 @@ class Best:
         return size
 
     def loss(self, size: FloatArray) -> float:
-        """Return the sum over the parameters of (expected error over wanted error) squared."""
+        """Return the sum over the parameters of expected error over wanted error."""
         rows = self.rows.reshape(size.size, *self.rows.shape[2:])
         return weighted_error(rows, self.weights, size.ravel() ** 2)

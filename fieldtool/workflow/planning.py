@@ -32,10 +32,15 @@ from fieldtool.workflow.best_spread import BestSpread
 SECONDS, SHORTEST_SECONDS, SWINGS = 60.0, 12.0, 125.0
 """Of excitation in all, where nothing else is asked for: so many swings of the slowest mode, in these
 bounds."""
-MULTIPLES = (1, 3, 5, 7, 9)
-"""Of the pilot's period that the main period may be: odd, so that odd lines fall on odd lines."""
-USUAL = 3
-"""Multiple that the pilot's period reckons with."""
+PILOT_TIME = 0.18
+"""Share of the time that a pilot of as many experiments as axes may take; else it is a single one."""
+SHORTER = (0.125, 0.25, 0.5)
+"""Of the longest period that the time allows: tried first, for they may tell enough."""
+NEARLY, CANDIDATES = 0.8, 10
+"""From this share of the longest period on, so many are tried: lines near to the resonances tell more
+than a little more time."""
+LONG_ENOUGH = 2.5
+"""Of the shortest period, from which an experiment has a period more."""
 ROUND = 0.04
 """Seconds that a pilot's period is a whole number of, so that it is one of all cycle times."""
 PILOT_SHAPE = Shape(-0.75)
@@ -57,6 +62,18 @@ class Wanted:
         """Return the largest expected error over what is wanted; 1 or less is good."""
         limits: dict[str, float] = vars(self)
         return max(MARGIN * expected.relative(kind) / limit for kind, limit in limits.items())
+
+    def mean(self, expected: Expected) -> float:
+        """Return the mean over the parameters of expected error over what is wanted."""
+        limits: dict[str, float] = vars(self)
+        shares = [
+            std / abs(value) / limits[p.kind]
+            for p, value, std in zip(
+                expected.parameters, expected.values, expected.std, strict=True
+            )
+            if value and p.kind in limits
+        ]
+        return MARGIN * float(np.mean(shares)) if shares else 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +141,7 @@ class Timing:
     pilot_experiments: int
     """M, or 1 where the time is short."""
     periods: int
-    """Of each experiment."""
+    """Of each main experiment; those of the pilot have PERIODS."""
     seconds_left: float
     """For the main experiments."""
 
@@ -136,16 +153,16 @@ def timing(setting: Setting, seconds: float) -> Timing:
     """
     axes, settle = len(setting.loops), settle_time(setting.model)
     seconds -= 2 * settle  # pilot and main experiments each end with a fade-out
-    least = shortest_period(setting.model)
-    for periods in (MORE_PERIODS, PERIODS):
-        longest = (seconds / axes - 2 * settle) / (periods * (1 + USUAL))
-        if longest >= least + ROUND:
-            period, count = ROUND * float(np.floor(longest / ROUND)), axes
-            break
-    else:
-        period, count, periods = ROUND * float(np.ceil(least / ROUND)), 1, PERIODS
-    left = float(seconds - count * (settle + periods * period))
-    return Timing(period, count, periods, max(left, axes * (settle + PERIODS * least)))
+    least = ROUND * float(np.ceil(shortest_period(setting.model) / ROUND))
+    longest = (PILOT_TIME * seconds / axes - settle) / PERIODS
+    count, period = (
+        (axes, ROUND * float(np.floor(longest / ROUND))) if longest >= least else (1, least)
+    )
+    left = max(
+        float(seconds - count * (settle + PERIODS * period)), axes * (settle + PERIODS * least)
+    )
+    more = (left / axes - settle) / MORE_PERIODS >= LONG_ENOUGH * least
+    return Timing(period, count, MORE_PERIODS if more else PERIODS, left)
 
 
 def plan_pilot(
@@ -169,7 +186,6 @@ def plan_pilot(
         name="pilot",
         share=PILOT_SHARE,
         offsets=offsets,
-        periods=times.periods,
     )
     forecast_multisine(plan, setting)
     return plan
@@ -208,36 +224,26 @@ def plan_main(
     PlanRefusedError
         If the machine can not be excited within its limits.
     """
-    chosen: tuple[float, float, BestSpread, Lines] | None = None
-    for multiple in MULTIPLES:
-        period = multiple * times.pilot_period
-        needed = len(setting.loops) * (settle_time(setting.model) + times.periods * period)
-        if chosen is not None and needed > times.seconds_left * (1 + 1e-6):
-            break
-        samples = times.periods * round(period / cycle_time)
-        spread = BestSpread(noise, samples, vars(wanted))
-        lines = telling_lines(setting, period, spread, offsets)
-        omega, torques = likely_torques(setting, period, spread, lines, offsets=offsets)
-        likely = [Excitation(omega, torque, samples) for torque in torques]
-        error = wanted.reached(expected_accuracy(setting.model, likely, noise))
-        if chosen is None or error < chosen[0]:
-            chosen = (error, period, spread, lines)
-        if chosen[0] <= 1.0 and fine_enough(period, setting.model):
+    chosen: _Candidate | None = None
+    for period in _periods(setting, cycle_time, times):
+        found = _candidate(setting, noise, period, times.periods, cycle_time, wanted, offsets)
+        if chosen is None or found.loss < chosen.loss:
+            chosen = found
+        if chosen.reached <= 1.0 and fine_enough(chosen.period, setting.model):
             break
     if chosen is None:
         raise PlanRefusedError(
             f"no period of the fast plan fits into {times.seconds_left:.3g} s: allow more time"
         )
-    _, period, spread, lines = chosen
     plan = experiments_for(
         setting,
         cycle_time,
-        period,
-        spread,
+        chosen.period,
+        chosen.spread,
         seed,
         offsets=offsets,
         periods=times.periods,
-        lines=lines,
+        lines=chosen.lines,
     )
     return PlannedFast(
         plan,
@@ -245,6 +251,46 @@ def plan_main(
         expected_accuracy(setting.model, excitations(plan, setting), noise),
         wanted,
     )
+
+
+def _periods(setting: Setting, cycle_time: float, times: Timing) -> list[float]:
+    """Return the periods to try, s, rising, whole numbers of cycles."""
+    settle, least = settle_time(setting.model), shortest_period(setting.model)
+    longest = (times.seconds_left / len(setting.loops) - settle) / times.periods * (1 + 1e-9)
+    shares = (*SHORTER, *np.linspace(NEARLY, 1.0, CANDIDATES))
+    cycles = {int(np.floor(longest * share / cycle_time)) for share in shares}
+    return [n * cycle_time for n in sorted(cycles) if n * cycle_time >= least]
+
+
+@dataclass(frozen=True, eq=False)
+class _Candidate:
+    """A period, and what it is likely to tell."""
+
+    period: float
+    spread: BestSpread
+    lines: Lines
+    reached: float
+    """Largest expected error over what is wanted."""
+    loss: float
+    """What is made small: the mean over all parameters of expected error over wanted error."""
+
+
+def _candidate(
+    setting: Setting,
+    noise: Noise,
+    period: float,
+    periods: int,
+    cycle_time: float,
+    wanted: Wanted,
+    offsets: Sequence[bool],
+) -> _Candidate:
+    samples = periods * round(period / cycle_time)
+    spread = BestSpread(noise, samples, vars(wanted))
+    lines = telling_lines(setting, period, spread, offsets)
+    omega, torques = likely_torques(setting, period, spread, lines, offsets=offsets)
+    likely = [Excitation(omega, torque, samples) for torque in torques]
+    expected = expected_accuracy(setting.model, likely, noise)
+    return _Candidate(period, spread, lines, wanted.reached(expected), wanted.mean(expected))
 
 
 def freed_of_friction(

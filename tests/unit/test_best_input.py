@@ -12,12 +12,11 @@ STRONG = 1e3
 """Of the rows: what is known before is nothing beside it."""
 
 
-def test_two_parameters_with_an_input_each_share_by_the_square_root() -> None:
-    """Least a/p + b/q with p + q = 1: p over q is the square root of a over b."""
+def test_two_parameters_with_an_input_each() -> None:
+    """Least a / sqrt(p) + b / sqrt(q) with p + q = 1: p / q is (a / b) to the power of 2/3."""
     rows = STRONG * np.eye(2).reshape(2, 1, 2)
-    weights = np.array([3.0, 1.0])
-    powers = best_powers(rows, weights, np.ones((1, 2)))
-    assert powers == pytest.approx([0.75, 0.25], rel=1e-3)
+    powers = best_powers(rows, np.array([8.0, 1.0]), np.ones((1, 2)))
+    assert powers == pytest.approx([0.8, 0.2], rel=1e-3)
 
 
 def test_a_line_that_tells_nothing_gets_nothing() -> None:
@@ -49,18 +48,27 @@ def test_no_random_powers_do_better(seed: int) -> None:
         assert weighted_error(rows, weights, other) > 0.93 * reached
 
 
-def test_a_general_solver_finds_the_same() -> None:
+def test_a_general_solver_finds_hardly_more() -> None:
     rng = np.random.default_rng(int(np.random.SeedSequence().generate_state(1)[0]))
-    rows = STRONG * rng.standard_normal((8, 2, 3))
-    weights, loads = rng.uniform(0.5, 2, 3), rng.uniform(0.2, 2, (3, 8))
-    start = 0.5 / loads.max(axis=0) / 8
+    over = []
+    for _ in range(7):
+        rows = STRONG * rng.standard_normal((8, 2, 3))
+        weights, loads = rng.uniform(0.5, 2, 3), rng.uniform(0.2, 2, (3, 8))
+        best = weighted_error(rows, weights, best_powers(rows, weights, loads))
+        over.append(best / generally(rows, weights, loads))
+    assert np.median(over) < 1.01
+    assert np.max(over) < 1.2
+
+
+def generally(rows: np.ndarray, weights: np.ndarray, loads: np.ndarray) -> float:
+    """Least error that sequential quadratic programming finds."""
     found = minimize(
-        lambda p: 1e6 * weighted_error(rows, weights, np.maximum(p, 0)),
-        start,
+        lambda p: 1e3 * weighted_error(rows, weights, np.maximum(p, 0)),
+        0.5 / loads.max(axis=0) / rows.shape[0],
         method="SLSQP",
-        bounds=[(0, None)] * 8,
+        bounds=[(0, None)] * rows.shape[0],
         constraints={"type": "ineq", "fun": lambda p: 1 - loads @ p},
         options={"maxiter": 500, "ftol": 1e-12},
     )
-    ours = weighted_error(rows, weights, best_powers(rows, weights, loads))
-    assert ours < 1.05 * weighted_error(rows, weights, np.maximum(found.x, 0))
+    powers = np.maximum(found.x, 0)
+    return weighted_error(rows, weights, powers / max(1.0, np.max(loads @ powers)))

@@ -115,13 +115,7 @@ def test_the_pilot_and_the_main_plan_fill_the_time() -> None:
         main = plan_main(where, CYCLE, noise, times, Wanted(1e-7, 1e-7, 1e-7, 1e-7), 2)
         total = pilot.duration + main.plan.duration
         assert 0.3 * seconds < total <= seconds
-        shared = np.isin(pilot.frequencies.round(6), odd_lines(main.plan.experiments[0]).round(6))
-        assert np.mean(shared) > 0.7  # pilot lines lie on the main plan's odd lines
         assert main.reached > 1
-
-
-def odd_lines(one: MultisineExperiment) -> np.ndarray:
-    return np.arange(1, one.lines[-1] + 1, 2) / one.period
 
 
 def test_a_modest_wish_takes_less_time() -> None:
