@@ -143,7 +143,7 @@ class Timing:
     periods: int
     """Of each main experiment; those of the pilot have PERIODS."""
     seconds_left: float
-    """For the main experiments."""
+    """For the main experiments, their fade-out included."""
 
 
 def timing(setting: Setting, seconds: float) -> Timing:
@@ -152,16 +152,15 @@ def timing(setting: Setting, seconds: float) -> Timing:
     Where the time is not even enough for the shortest experiments, that much is taken.
     """
     axes, settle = len(setting.loops), settle_time(setting.model)
-    seconds -= 2 * settle  # pilot and main experiments each end with a fade-out
+    seconds -= settle  # the pilot ends with a fade-out, as the main experiments do
     least = ROUND * float(np.ceil(shortest_period(setting.model) / ROUND))
     longest = (PILOT_TIME * seconds / axes - settle) / PERIODS
     count, period = (
         (axes, ROUND * float(np.floor(longest / ROUND))) if longest >= least else (1, least)
     )
-    left = max(
-        float(seconds - count * (settle + PERIODS * period)), axes * (settle + PERIODS * least)
-    )
-    more = (left / axes - settle) / MORE_PERIODS >= LONG_ENOUGH * least
+    shortest = axes * (settle + PERIODS * least) + settle
+    left = max(float(seconds - count * (settle + PERIODS * period)), shortest)
+    more = ((left - settle) / axes - settle) / MORE_PERIODS >= LONG_ENOUGH * least
     return Timing(period, count, MORE_PERIODS if more else PERIODS, left)
 
 
@@ -256,7 +255,8 @@ def plan_main(
 def _periods(setting: Setting, cycle_time: float, times: Timing) -> list[float]:
     """Return the periods to try, s, rising, whole numbers of cycles."""
     settle, least = settle_time(setting.model), shortest_period(setting.model)
-    longest = (times.seconds_left / len(setting.loops) - settle) / times.periods * (1 + 1e-9)
+    each = (times.seconds_left - settle) / len(setting.loops) - settle
+    longest = each / times.periods * (1 + 1e-9)
     shares = (*SHORTER, *np.linspace(NEARLY, 1.0, CANDIDATES))
     cycles = {int(np.floor(longest * share / cycle_time)) for share in shares}
     return [n * cycle_time for n in sorted(cycles) if n * cycle_time >= least]

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.optimize import nnls
 
 from fieldtool.errors import IdentificationError, NotEnoughDataError
-from fieldtool.frf.phasors import Phasors, equation_errors
+from fieldtool.frf.phasors import ComplexArray, Phasors, equation_errors
 from fieldtool.identify.chains.forward import spectra
 from fieldtool.identify.likelihood.expected import Noise
 from fieldtool.identify.likelihood.joint_data import frequencies_of, joint_spectra
@@ -17,8 +17,9 @@ from fieldtool.identify.multisine.dry_friction import (
     dry_friction,
     without_dry_friction,
 )
-from fieldtool.identify.multisine.identify import phasors_of
+from fieldtool.identify.multisine.identify import lines_of, phasors_of
 from fieldtool.identify.multisine.records import settled, with_periods
+from fieldtool.identify.multisine.whole_records import WholeRecords
 from fieldtool.records.model import Estimate, FloatArray, MachineModel
 from fieldtool.records.recording import Experiment, Recording
 
@@ -30,6 +31,12 @@ POOR_FIT = 30.0
 """Misfit (chi2 over degrees of freedom) above which it is said that the model is only the nearest."""
 BEYOND = 2.0
 """Factor by which a mode may lie outside the pilot's lines and still be believed."""
+LEAST_FREEDOM = 0.1
+"""Share of a bin that the states at the ends may use up, and it still tells the noise."""
+POWER_ROUNDS = 6
+"""Of weighting the powers of errors by what noise explains of them."""
+LEAST_POWER = 1e-3
+"""Of what was expected the round before, and of the median power at first."""
 SMALLEST = 1e-12
 """rad or m: noise of a position that shows none."""
 FRICTION_ROUNDS = 6
@@ -75,7 +82,8 @@ def read_pilot(recording: Recording, prior: MachineModel) -> PilotFindings:
     experiments = [e for e in recording.experiments if e.kind == "multisine" and e.complete]
     if not experiments:
         raise NotEnoughDataError("there is no complete multisine experiment to be read as a pilot")
-    phasors = phasors_of(recording, experiments)
+    lines = lines_of(recording, experiments)
+    phasors = tuple(one.phasors(recording.names) for one in lines)
     step = recording.sample_period
     notes: list[str] = []
     explained = _explained(phasors, experiments, step, prior, notes)
@@ -83,7 +91,11 @@ def read_pilot(recording: Recording, prior: MachineModel) -> PilotFindings:
         noise = _noise(phasors, experiments, step, prior, np.zeros(len(prior.axes)))
         return PilotFindings(prior, noise, None, tuple(notes))
     fitted, friction = explained
-    noise = _noise(phasors, experiments, step, fitted.model, fitted.delay_values)
+    records = WholeRecords.of(recording, lines, friction)
+    if records.too_long:
+        noise = _noise(phasors, experiments, step, fitted.model, fitted.delay_values)
+    else:
+        fitted, noise = _with_free_motion(fitted, records, prior)
     for k in friction.seen(FRICTION_SEEN):
         unit = recording.axes[k].torque_unit
         one = friction.torque[k]
@@ -158,21 +170,64 @@ def _noise(
     What noise makes the loops do is in torque and position alike and tells as much as excitation;
     what counts is the scatter of Theta - G T, here put down to independent noise of both.
     """
-    axes = len(model.axes)
-    rows, sides = [], []
+    seen = []
     for one, experiment in zip(phasors, experiments, strict=True):
         samples = round(float(experiment.period or 0.0) / sample_period)
-        counted = experiment.samples // samples * samples
         response = machine_response(model, 2 * np.pi * one.frequencies, delays)
         error = np.einsum("fkk->fk", equation_errors(response, one.covariance)).real
-        passed = np.concatenate(
-            [np.abs(response) ** 2, np.broadcast_to(np.eye(axes), response.shape)], axis=2
+        seen.append((response, error, experiment.samples // samples * samples))
+    return _explaining(seen, rounds=1)
+
+
+def _with_free_motion(
+    start: RefinedModel, records: WholeRecords, prior: MachineModel
+) -> tuple[RefinedModel, Noise]:
+    """Fit whole records: what is left of transients in so few periods is neither machine nor noise."""
+    step = records.recording.sample_period
+    found = start
+    for _ in range(WEIGHTINGS):
+        data = records.data(found, run_in=False)
+        found = refine(
+            found.model,
+            data,
+            priors=_trusted(prior),
+            fit_delay=True,
+            fit_friction=True,
+            delays=found.delay_values.tolist(),
         )
-        rows.append((passed / error[:, :, None]).reshape(-1, 2 * axes))
-        sides.append(np.full(error.size, counted / 4))
-    matrix = np.vstack(rows)
-    scale = np.linalg.norm(matrix, axis=0)
-    variance = nnls(matrix / scale, np.concatenate(sides))[0] / scale
+    seen = []
+    for system in data.systems(found.model, found.delay_values):
+        error = np.linalg.solve(system.whiten, system.white[:, :, None])[:, :, 0]
+        power = np.abs(error) ** 2 / np.maximum(system.freedom, LEAST_FREEDOM)[:, None]
+        response = machine_response(found.model, system.one.omega, found.delay_values)
+        seen.append((response, power, round(system.one.duration / step)))
+    return found, _explaining(seen, POWER_ROUNDS)
+
+
+def _explaining(seen: Sequence[tuple[ComplexArray, FloatArray, int]], rounds: int) -> Noise:
+    """Noise that explains powers of the equation error (F, M): responses, these, samples of each.
+
+    In the first round each counts by itself, which does for means; single powers scatter as much as
+    they are large, and then count by what is expected of them (quasi-likelihood: McCullagh and Nelder,
+    Generalized Linear Models, chapter 9).
+    """
+    axes = seen[0][0].shape[1]
+    rows = np.vstack(
+        [
+            np.concatenate(
+                [np.abs(g) ** 2, np.broadcast_to(np.eye(axes), g.shape)], axis=2
+            ).reshape(-1, 2 * axes)
+            * (4.0 / samples)
+            for g, _, samples in seen
+        ]
+    )
+    power = np.concatenate([one.ravel() for _, one, _ in seen])
+    scale = np.linalg.norm(rows, axis=0)
+    expected = np.maximum(power, LEAST_POWER * float(np.median(power)))
+    for _ in range(rounds):
+        weighted = rows / (scale * expected[:, None])
+        variance = nnls(weighted, power / expected)[0] / scale
+        expected = np.maximum(rows @ variance, LEAST_POWER * expected)
     std = np.sqrt(variance)
     return Noise(torque=std[:axes], position=np.maximum(std[axes:], SMALLEST))
 
