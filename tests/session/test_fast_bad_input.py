@@ -130,15 +130,15 @@ def twice(experiments, rng):
 CASES = {
     "too short": (
         lambda e, _: [periods(one, 1.5) for one in e],
-        ("fast 1", "1.50 periods of 1.56 s", "at least 2", "measure longer"),
+        ("fast 1", "1.50 periods of", "at least 2", "measure longer"),
     ),
     "less than a period": (
         lambda e, _: [periods(one, 0.6) for one in e],
-        ("fast 1", "0.60 periods of 1.56 s", "at least 2", "measure longer"),
+        ("fast 1", "0.60 periods of", "at least 2", "measure longer"),
     ),
     "too short to find a period": (
         lambda e, _: [replace(periods(one, 1.3), period=None) for one in e],
-        ("fast 1", "no period given", "repeat at no shift up to 1.014 s", "at least two whole"),
+        ("fast 1", "no period given", "repeat at no shift up to", "at least two whole"),
     ),
     "never repeats": (
         lambda e, rng: [never_repeating(one, rng) for one in e],
@@ -329,7 +329,7 @@ def test_a_loop_that_becomes_unstable_in_the_pilot(make_bench, monkeypatch, fact
     in_the_pilot(bench, monkeypatch, GainsRise(TABLE, factor), 1500)
     outcome = bench.command("measure", bench.profile, "--out", bench.out, "--time", 20)
     named_with_exit_code_5(
-        outcome, ("table: its loop becomes unstable", "experiment pilot 1", "Hz", "gains")
+        outcome, ("table: its loop becomes unstable", "experiment pilot", "Hz", "gains")
     )
     assert "what stopped the axes: table: torque" in outcome.err
     kept_and_safe(bench)
