@@ -9,7 +9,16 @@ from drives.parameters.backup import Backup, DriveBackup, back_up, load_backup, 
 from drives.parameters.bring_back import Found
 from drives.parameters.changes import Change, Written, planned_changes, read_loop, read_parameters
 from drives.parameters.guard import check_disabled, check_objects, check_same_drives
-from drives.parameters.journal import DriveRecord, Journal, JournalEntry, Memory, Phase, Storing
+from drives.parameters.journal import (
+    Action,
+    DriveRecord,
+    Journal,
+    JournalEntry,
+    Memory,
+    Phase,
+    Step,
+    Storing,
+)
 from drives.parameters.journal_file import load_journal, save_journal
 from drives.parameters.outcome import MEMORY_WORDS, DriveOutcome
 from drives.parameters.store import check_can_store
@@ -18,6 +27,7 @@ from drives.parameters.values import HeldObject, Raw, same
 
 __all__ = [
     "MEMORY_WORDS",
+    "Action",
     "Backup",
     "Change",
     "DriveBackup",
@@ -30,6 +40,7 @@ __all__ = [
     "Memory",
     "Phase",
     "Raw",
+    "Step",
     "Storing",
     "Transaction",
     "Written",

@@ -23,6 +23,8 @@ from drives.parameters.values import ParameterDrive, same
 
 Save = Callable[[Journal], None]
 """Brings a journal to the disk before it returns."""
+Tell = Callable[[Step], None]
+"""Is told which step begins."""
 ROUNDS = 3
 """Times that everything is brought back at most, where drives lose their supply meanwhile."""
 
@@ -44,11 +46,19 @@ class Transaction:
         Everything that the drives held before it.
     save
         Is given the journal before and after each step; an OSError ends the write.
+    tell
+        Is told which step begins.
     """
 
     def __init__(
-        self, drives: Iterable[ParameterDrive], journal: Journal, backup: Backup, save: Save
+        self,
+        drives: Iterable[ParameterDrive],
+        journal: Journal,
+        backup: Backup,
+        save: Save,
+        tell: Tell = lambda _: None,
     ) -> None:
+        self._tell = tell
         self._drives = {drive.axis: drive for drive in drives}
         self._backups = {part.axis: part for part in backup.drives}
         self._save = save
@@ -84,6 +94,7 @@ class Transaction:
             raise
 
     def _step_forward(self, step: Step) -> None:
+        self._tell(step)
         drive = self._drives.get(step.axis)
         if step.action in (Action.STORE, Action.FINISH):
             with uninterrupted():  # a stop waits for the answer, which says what the memory holds
@@ -190,6 +201,7 @@ class Transaction:
         for outcome in self.outcomes.values():
             outcome.trouble = ""
         while (step := next_step(self.journal, given_up)) is not None:
+            self._tell(step)
             self._go_quietly(self.journal.began(step))
             try:
                 if step.action is Action.FINISH:

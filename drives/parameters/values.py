@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from drives.api import DriveIdentity
+from drives.api import Drive
 from drives.cia402 import PowerState
 from drives.objects import ObjectAddress, ObjectInfo
 from drives.profile import AxisProfile, DriveProfile
@@ -12,20 +12,8 @@ Raw = int | float | str
 """A value in the drive's own type and unit."""
 
 
-class ParameterDrive(Protocol):
+class ParameterDrive(Drive, Protocol):
     """What reading, writing and storing parameters needs of a drive; ``CanopenDrive`` has it all."""
-
-    @property
-    def axis(self) -> str:
-        """Name of the axis."""
-
-    @property
-    def node_id(self) -> int:
-        """CANopen node id."""
-
-    @property
-    def identity(self) -> DriveIdentity:
-        """What the drive says of itself."""
 
     @property
     def profile(self) -> DriveProfile:

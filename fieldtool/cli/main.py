@@ -448,10 +448,11 @@ def restore(
     if machine is None:
         machine = str(folder / "machine.yaml")
     traced = trace_path(trace, trace_file, folder)
-    with stop_key():
+    console = console_of(as_json)
+    with stop_key(), TerminalScreen(console) as screen:
         profile = on_bus(machine, interface, channel, bitrate)
-        restored = workflow.restore(profile, backup, store, traced, same_drives)
-    show_restored(console_of(as_json), restored)
+        restored = workflow.restore(profile, backup, store, traced, same_drives, screen)
+    show_restored(console, restored)
     if as_json:
         print_json(restored.as_dict())
 

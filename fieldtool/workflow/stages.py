@@ -34,6 +34,7 @@ from fieldtool.workflow.measuring import measured
 from fieldtool.workflow.models import data_sheet_masses, prior_model, truth_model
 from fieldtool.workflow.session import (
     Options,
+    Quiet,
     Screen,
     Session,
     SessionResult,
@@ -232,6 +233,7 @@ def restore(
     store: bool = False,
     trace: Path | None = None,
     same_drives: bool = False,
+    screen: Screen | None = None,
 ) -> Restored:
     """Bring a backup back into a machine's drives, or take back a write that was cut off.
 
@@ -247,16 +249,28 @@ def restore(
         File that every frame is noted in; none where it is None.
     same_drives
         The user's word that drives without a serial number are those of the backup.
+    screen
+        Is told what happens.
 
     Raises
     ------
     ProfileError, WrongDeviceError, WriteBackMixedError
         If the backup is none, was made on other drives, or does not come back whole.
     """
+    screen = screen or Quiet()
     source = source_of(backup, store)
     profile = machine if isinstance(machine, MachineProfile) else load_machine(machine)
+    screen.stage(f"Connect to {profile.name}")
     with connect(profile, trace=trace, to_move=False) as group:
-        return bring_back(profile.name, group.drives, source, store=store, same_drives=same_drives)
+        screen.stage("Bring the old parameters back")
+        return bring_back(
+            profile.name,
+            group.drives,
+            source,
+            store=store,
+            same_drives=same_drives,
+            say=screen.say,
+        )
 
 
 def _measured(session: Session, group: CanopenGroup, options: Options) -> float:
@@ -381,6 +395,7 @@ def _write(
         folder.parameters_before,
         confirm,
         options.store,
+        session.screen.say,
     )
     folder.note("write", written=result.in_memory, stored=result.stored)
     session.screen.say(result.sentence)

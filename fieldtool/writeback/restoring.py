@@ -1,6 +1,6 @@
 """Bring a backup back, or take a write back that was cut off."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -9,6 +9,7 @@ from typing import Any
 from drives.canopen_drive import CanopenDrive
 from drives.errors import ProfileError
 from drives.parameters import (
+    Action,
     Backup,
     DriveBackup,
     DriveOutcome,
@@ -18,6 +19,7 @@ from drives.parameters import (
     JournalEntry,
     Memory,
     Phase,
+    Step,
     Storing,
     Transaction,
     check_can_store,
@@ -28,6 +30,7 @@ from drives.parameters import (
     load_journal,
 )
 from drives.parameters.journal import Goal
+from fieldtool.writeback.transaction import tell_storing
 from fieldtool.writeback.unfinished import JOURNAL, JournalKeeper, not_kept
 
 FIRST_BACKUP = "parameters-before.yaml"
@@ -141,6 +144,7 @@ def bring_back(
     *,
     store: bool = False,
     same_drives: bool = False,
+    say: Callable[[str], None] = lambda _: None,
 ) -> Restored:
     """Bring all parameters of a backup back into all its drives, and store them where that is needed.
 
@@ -157,6 +161,8 @@ def bring_back(
         hold new values store the old ones in any case.
     same_drives
         The user's word that drives without a serial number are those of the backup.
+    say
+        Is told what is done with which drive.
 
     Raises
     ------
@@ -185,7 +191,14 @@ def bring_back(
     check_disabled(by_axis[part.axis] for part in source.backup.drives)
     taking_part = [by_axis[part.axis] for part in source.backup.drives]
     keeper = JournalKeeper(source.backup_path.with_name(JOURNAL))
-    transaction = Transaction(taking_part, journal, source.backup, keeper)
+    counts = {part.axis: len(part.held) for part in source.backup.drives}
+
+    def tell(step: Step) -> None:
+        if step.action is Action.BRING_BACK:
+            say(f"{step.axis}: comparing {counts[step.axis]} parameters, and bringing them back")
+        tell_storing(drives, say)(step)
+
+    transaction = Transaction(taking_part, journal, source.backup, keeper, tell)
     try:
         transaction.restore()
     except OSError as error:

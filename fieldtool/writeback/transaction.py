@@ -8,10 +8,12 @@ from pathlib import Path
 from drives.canopen_drive import CanopenDrive
 from drives.errors import NotSupportedError
 from drives.parameters import (
+    Action,
     Change,
     DriveRecord,
     Journal,
     JournalEntry,
+    Step,
     Storing,
     Transaction,
     Written,
@@ -20,6 +22,7 @@ from drives.parameters import (
     load_backup,
     planned_changes,
 )
+from drives.profile import Store
 from fieldtool.design.tuning import Tuning
 from fieldtool.writeback.backups import take_backup
 from fieldtool.writeback.unfinished import JOURNAL, JournalKeeper, not_kept, refuse_unfinished
@@ -83,6 +86,7 @@ def apply(
     backup_path: Path,
     confirm: Confirm,
     keep: bool = False,
+    say: Callable[[str], None] = lambda _: None,
 ) -> WriteBack:
     """Back up, show, ask, write, read back, and store if wanted: all drives or none.
 
@@ -102,6 +106,8 @@ def apply(
         Sees old and new values and says whether to write.
     keep
         Store in non-volatile memory too.
+    say
+        Is told which drive stores, and how long that may take.
 
     Raises
     ------
@@ -128,13 +134,29 @@ def apply(
     storing = Storing.ALL if keep else Storing.NONE
     journal = planned_journal(machine, drives, changes, backup_path.name, storing)
     keeper = JournalKeeper(backup_path.with_name(JOURNAL))
-    transaction = Transaction(drives, journal, load_backup(backup_path), keeper)
+    backup = load_backup(backup_path)
+    transaction = Transaction(drives, journal, backup, keeper, tell_storing(drives, say))
     try:
         transaction.write()
     except OSError as error:
         raise not_kept(keeper, error) from error
     written = tuple(Written(change, change.after) for change in changes)
     return WriteBack(written, changes, in_memory=True, stored=keep, backup=backup_path)
+
+
+def tell_storing(
+    drives: Sequence[CanopenDrive], say: Callable[[str], None]
+) -> Callable[[Step], None]:
+    """Return what tells a person that a drive begins to store, and how long that may take."""
+    longest = {
+        d.axis: d.profile.store.timeout for d in drives if isinstance(d.profile.store, Store)
+    }
+
+    def tell(step: Step) -> None:
+        if step.action is Action.STORE and step.axis in longest:
+            say(f"{step.axis}: storing, at most {longest[step.axis]:g} s")
+
+    return tell
 
 
 def planned_journal(
