@@ -6,6 +6,7 @@ so a file is looked at before it is handed over.
 
 import re
 from functools import lru_cache
+from io import StringIO
 from pathlib import Path
 
 from canopen.objectdictionary import (
@@ -60,12 +61,14 @@ def read_eds(path: Path) -> ObjectDictionary:
 @lru_cache(maxsize=64)
 def _read(path: Path, _changed: int) -> ObjectDictionary:
     try:
-        text = path.read_bytes().decode("utf-8-sig", errors="replace")
+        text = _decoded(path.read_bytes())
     except OSError as error:
         raise ProfileError(path, f"can not be read: {error.strerror}") from None
     _check_shape(path, text)
+    source = StringIO(text)
+    source.name = str(path.with_suffix(".eds"))  # by which the reader knows what it is
     try:
-        dictionary = import_od(str(path))
+        dictionary = import_od(source)
     except RecursionError:
         raise ProfileError(path, "is no EDS that can be read: it refers to itself") from None
     except Exception as error:  # the EDS reader raises whatever its parser stumbles upon
@@ -76,6 +79,14 @@ def _read(path: Path, _changed: int) -> ObjectDictionary:
     if not len(dictionary):
         raise ProfileError(path, "is no EDS: it describes no object")
     return dictionary
+
+
+def _decoded(data: bytes) -> str:
+    """Return a file's text: UTF-8, or the code page of Western Windows, as makers write names."""
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return data.decode("latin-1")
 
 
 def _check_shape(path: Path, text: str) -> None:

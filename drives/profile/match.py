@@ -191,7 +191,8 @@ def _gains(profile: DriveProfile) -> list[str]:
     found = [words[profile.gains_via]] if profile.gains_via in words else []
     lacking = [name for name, one in profile.parameters.items() if one.factor == UNKNOWN]
     if lacking:
-        found.append(f"units of {', '.join(lacking)} are not known, so they are not written")
+        more = f" and {len(lacking) - 4} more" if len(lacking) > 4 else ""
+        found.append(f"units of {', '.join(lacking[:4])}{more} are not known: they are not written")
     return found
 
 

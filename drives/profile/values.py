@@ -93,7 +93,10 @@ def unknown_keys(value: Any, place: str = "") -> tuple[str, ...]:
         return (place,)
     items: list[tuple[Any, Any]] = []
     if isinstance(value, BaseModel):
-        items = [(name, getattr(value, name)) for name in type(value).model_fields]
+        items = [
+            (told.alias or name, getattr(value, name))
+            for name, told in type(value).model_fields.items()
+        ]
     elif isinstance(value, dict):
         items = list(value.items())
     elif isinstance(value, tuple | list):

@@ -34,6 +34,7 @@ from fieldtool import workflow
 from fieldtool.cli.bus_options import Bitrate, Channel, Interface, on_bus
 from fieldtool.cli.check import check
 from fieldtool.cli.output import console_of, print_json
+from fieldtool.cli.profile import profile_app
 from fieldtool.cli.replay import replay_command
 from fieldtool.cli.restored import show_restored
 from fieldtool.cli.scan import scan
@@ -494,6 +495,7 @@ def simulate(
 
 
 app.command()(scan)
+app.add_typer(profile_app, name="profile")
 app.command()(check)
 app.command("replay")(replay_command)
 

@@ -1,0 +1,200 @@
+"""First profiles from EDS files, JSON schemas, and EDS files that are none."""
+
+import json
+from pathlib import Path
+
+import pytest
+import yaml
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from drives.errors import ProfileError
+from drives.profile import load_drive, load_machine, packaged
+from drives.profile.draft import draft, profile_name
+from drives.profile.eds import MAX_EDS_BYTES, read_eds
+from drives.profile.schema import json_schema
+from fieldtool.errors import OutputError
+from fieldtool.workflow.profiling import check_profile, new_profile
+
+FOLDER = Path(load_drive("reference").path).parent
+SHIPPED = sorted(p.name for p in FOLDER.iterdir() if p.suffix in (".eds", ".dcf"))
+SMALLEST = """[DeviceInfo]
+VendorNumber=0x12
+[MandatoryObjects]
+SupportedObjects=1
+1=0x1000
+[1000]
+ParameterName=Device type
+ObjectType=0x7
+DataType=0x0007
+AccessType=ro
+DefaultValue=0x20192
+"""
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_a_first_profile_can_be_read_and_says_what_is_open(name, tmp_path):
+    made = new_profile(FOLDER / name, tmp_path / "new.yaml")
+    profile = load_drive(made.path)
+    text = made.path.read_text(encoding="utf-8")
+    assert set(made.unknown) >= {"torque" if profile.torque == "unknown" else "torque.scale"}
+    assert {"gains_via", "store", "recovery", "heartbeat_reaction"} <= set(made.unknown)
+    for key in made.unknown:  # every one stands in the file, for a person to find
+        assert f"{key.split('.')[-1]}: unknown" in text
+    assert all(p.factor == "unknown" for p in profile.parameters.values())
+    assert made.obstacles
+
+
+def test_what_the_file_tells_is_taken_over(tmp_path):
+    made = new_profile(FOLDER / "elmo-simpliq.dcf", tmp_path / "mine.yaml")
+    profile = load_drive(made.path)
+    assert profile.identity.vendor_id == 0x9A
+    assert profile.modes == (1, 3, 4, 6, 7)
+    assert "can not measure with it" in made.path.read_text(encoding="utf-8")
+    assert any("no cyclic position mode" in phrase for phrase in made.obstacles)
+
+
+def test_gains_are_listed_with_their_types(tmp_path):
+    made = new_profile(FOLDER / "epos4.eds", tmp_path / "mine.yaml")
+    found = load_drive(made.path).parameters["position_controller_p_gain"]
+    assert str(found.object) == "0x30A1:01"
+    assert found.type == "UNSIGNED32"
+
+
+def test_a_file_that_is_there_is_not_overwritten(tmp_path):
+    path = tmp_path / "mine.yaml"
+    path.write_text("precious")
+    with pytest.raises(OutputError, match="is there already and is not overwritten"):
+        new_profile(FOLDER / "epos4.eds", path)
+    assert path.read_text() == "precious"
+
+
+@pytest.mark.parametrize(
+    ("stem", "name"),
+    [("EPOS4", "EPOS4"), ("4711 a.b", "drive-4711-a-b"), ("ä", "drive"), ("x" * 50, "x" * 32)],
+)
+def test_names(stem, name):
+    assert profile_name(Path(f"{stem}.eds")) == name
+
+
+@pytest.mark.parametrize("name", packaged("drives"))
+def test_packaged_drive_profiles_fit_the_schema(name):
+    schema = json_schema("drive")
+    data = yaml.safe_load((FOLDER / f"{name}.yaml").read_text(encoding="utf-8"))
+    assert set(data) <= set(schema["properties"])
+    assert set(schema["required"]) <= set(data)
+    assert schema["additionalProperties"] is False
+    for parameter in data.get("parameters", {}).values():
+        assert set(parameter) <= set(schema["$defs"]["ParameterInfo"]["properties"])
+
+
+def test_schemas_are_json_and_show_limits_as_they_are_written():
+    schema = json.loads(json.dumps(json_schema("machine")))
+    limits = schema["$defs"]["Limits"]
+    assert limits["properties"]["velocity"]["type"] == "string"
+    assert set(limits["required"]) == {
+        "travel",
+        "velocity",
+        "acceleration",
+        "torque",
+        "following_error",
+    }
+    for name in packaged("machines"):
+        data = yaml.safe_load(Path(load_machine(name).path).read_text(encoding="utf-8"))
+        assert set(data) <= set(schema["properties"])
+
+
+def test_checking_tells_kind_and_open_facts(tmp_path):
+    assert check_profile(FOLDER / "reference.yaml").kind == "drive"
+    machine = Path(load_machine("paper-3x3").path)
+    assert check_profile(machine).name == "paper-3x3"
+    wrong = tmp_path / "x.yaml"
+    wrong.write_text("format: fieldtool-model/1\n")
+    with pytest.raises(
+        ProfileError, match="format must be fieldtool-drive/1 or fieldtool-machine/1"
+    ):
+        check_profile(wrong)
+
+
+def test_a_type_that_the_eds_does_not_have_is_named(tmp_path):
+    text = (FOLDER / "reference.yaml").read_text(encoding="utf-8")
+    path = tmp_path / "mine.yaml"
+    path.write_text(text.replace('"0x2010:02", type: UNSIGNED32', '"0x2010:02", type: REAL32'))
+    (tmp_path / "reference.eds").write_bytes((FOLDER / "reference.eds").read_bytes())
+    with pytest.raises(ProfileError) as refused:
+        check_profile(path)
+    assert "parameters.velocity_p: object 0x2010:02 is REAL32 here and UNSIGNED32 in" in str(
+        refused.value
+    )
+
+
+# --- files that are no EDS -----------------------------------------------------------------------
+
+
+def eds_of(tmp_path: Path, content: bytes | str) -> Path:
+    path = tmp_path / "drive.eds"
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    return path
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ("", "is no EDS: it has none of the sections"),
+        ("nonsense without any section\n", "is no EDS: it has none of the sections"),
+        (SMALLEST.encode("utf-16"), "is not plain text (UTF-16 or binary?)"),
+        (b"\x00\x01\x02" * 50, "is not plain text"),
+        ("[MandatoryObjects]\nSupportedObjects=1\n1=0x1000\n", "is no EDS"),
+        ("[MandatoryObjects]\nSupportedObjects=lots\n", "is no EDS that can be read"),
+        (SMALLEST.replace("DataType=0x0007", "DataType=what"), "is no EDS that can be read"),
+        (SMALLEST + "CompactSubObj=4000000000\n", "says that an object has 4000000000 sub-indices"),
+        (SMALLEST + "[[[[\n=\n", "is no EDS that can be read"),
+    ],
+)
+def test_what_is_no_eds_is_refused_in_one_sentence(tmp_path, content, said):
+    path = eds_of(tmp_path, content)
+    with pytest.raises(ProfileError) as refused:
+        read_eds(path)
+    assert said in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_large_and_missing_files_are_refused(tmp_path):
+    with pytest.raises(ProfileError, match="can not be read"):
+        read_eds(tmp_path / "nothing.eds")
+    with pytest.raises(ProfileError, match="can not be read"):
+        read_eds(tmp_path)
+    path = eds_of(tmp_path, SMALLEST + ";" * MAX_EDS_BYTES)
+    with pytest.raises(ProfileError, match="is too large for an EDS"):
+        read_eds(path)
+
+
+def test_a_file_in_the_makers_code_page_is_read(tmp_path):
+    path = eds_of(tmp_path, SMALLEST.replace("Device type", "Gerätetyp").encode("latin-1"))
+    assert len(read_eds(path)) == 1
+
+
+@settings(
+    max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(data=st.data())
+def test_spoilt_files_are_read_or_refused_never_anything_else(tmp_path, data):
+    good = (FOLDER / "prbt.dcf").read_bytes()[:20_000]
+    content = bytearray(data.draw(st.sampled_from([good, SMALLEST.encode()])))
+    for _ in range(data.draw(st.integers(1, 6))):
+        place = data.draw(st.integers(0, len(content) - 1))
+        piece = data.draw(
+            st.binary(max_size=12) | st.sampled_from([b"[", b"=", b"\n", b"0x", b"$NODEID"])
+        )
+        content[place : place + data.draw(st.integers(0, 30))] = piece
+    path = eds_of(tmp_path, bytes(content))
+    try:
+        dictionary = read_eds(path)
+        text = draft(dictionary, "spoilt", path.name)
+        (tmp_path / "spoilt.yaml").write_text(text, encoding="utf-8")
+        load_drive(tmp_path / "spoilt.yaml")
+    except ProfileError as refused:
+        said = str(refused)
+    else:
+        said = ""
+    assert "\n" not in said
