@@ -1,11 +1,14 @@
 """Objects that are changed while the tool runs, and put back afterwards."""
 
+from math import remainder
+
 from drives import objects
 from drives.canopen_drive.drive import CanopenDrive
 from drives.canopen_drive.torque_offset import TORQUE_OFFSET
 from drives.cia402 import Mode
 from drives.errors import DrivesError, NotSupportedError, SdoAbortError, SdoTimeoutError
 from drives.objects import ObjectAddress, ObjectInfo, type_bits
+from drives.profile import UNKNOWN
 
 PDO_OFF = 1 << 31
 NO_MODE = 0
@@ -112,11 +115,34 @@ def cycle(drive: CanopenDrive, cycle_time: float, changes: TemporaryObjects) -> 
             f"{drive.axis}: a cycle of {cycle_time * 1000:g} ms is not 1 to 255 times "
             f"{10.0**exponent:g} s, as 0x60C2 needs it."
         )
+    _check_sync(drive, cycle_time)
     changes.change(objects.INTERPOLATION_INDEX, exponent)
     changes.change(objects.INTERPOLATION_VALUE, round(value))
     period = drive.read_optional(objects.SYNC_PERIOD)
     if period:
         changes.change(objects.SYNC_PERIOD, round(cycle_time * 1e6), period)
+
+
+def _check_sync(drive: CanopenDrive, cycle_time: float) -> None:
+    """Refuse a cycle that the drive's profile says the drive can not follow."""
+    rules, name = drive.profile.sync, drive.profile.name
+    shortest, longest, multiple = (
+        None if value == UNKNOWN else float(value)
+        for value in (rules.shortest, rules.longest, rules.multiple)
+    )
+    said = f"{drive.axis}: a cycle of {cycle_time * 1000:g} ms is"
+    if shortest is not None and cycle_time < shortest * (1 - 1e-9):
+        raise NotSupportedError(
+            f"{said} shorter than {shortest * 1000:g} ms, the shortest that drive profile {name} allows."
+        )
+    if longest is not None and cycle_time > longest * (1 + 1e-9):
+        raise NotSupportedError(
+            f"{said} longer than {longest * 1000:g} ms, the longest that drive profile {name} allows."
+        )
+    if multiple is not None and abs(remainder(cycle_time, multiple)) > 1e-6 * multiple:
+        raise NotSupportedError(
+            f"{said} no multiple of {multiple * 1000:g} ms, as drive profile {name} wants it."
+        )
 
 
 def clear_torque_offset(drive: CanopenDrive, changes: TemporaryObjects, *, streamed: bool) -> None:
@@ -158,6 +184,11 @@ def process_data(
     outputs = OUTPUTS_WITH_OFFSET if torque_offset else OUTPUTS
     for wanted in (*outputs, *INPUTS):
         info = drive.info(wanted.address)
+        if info is None:
+            raise NotSupportedError(
+                f"{drive.axis}: the drive has no {wanted.name} {wanted.address.short}, which the tool's "
+                "PDOs carry, by its EDS file. It can not be measured."
+            )
         if info is not None and type_bits(info.type) != type_bits(wanted.type):
             raise NotSupportedError(
                 f"{drive.axis}, object {wanted.address} ({wanted.name}): the drive has "

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drives.canopen_drive import CanopenDrive
+from drives.canopen_drive import CanopenDrive, setup
 from drives.canopen_drive.conversion import Conversion
 from drives.canopen_drive.line import Line
 from drives.canopen_drive.recovery import recover
@@ -275,3 +275,29 @@ def test_the_same_machine_whatever_its_face():
     """The face changes what is seen, not what is behind: hardware and plant are the same."""
     one, other = simulated("reference"), simulated("epos4")
     assert replace(one, face=other.face).hardware == one.hardware
+
+
+@pytest.mark.parametrize(
+    ("cycle", "said"),
+    [
+        (0.0005, "not 1 to 255 times"),
+        (0.002, "shorter than 4 ms, the shortest that drive profile epos4 allows"),
+        (0.2, "longer than 100 ms, the longest that drive profile epos4 allows"),
+        (0.007, "no multiple of 2 ms, as drive profile epos4 wants it"),
+    ],
+)
+def test_cycles_that_the_drive_can_not_follow_are_refused(connected, cycle, said):
+    profile = load_drive("epos4")
+    sync = profile.sync.model_copy(update={"shortest": 0.004, "multiple": 0.002})
+    drive, node, _ = connected("epos4", profile.model_copy(update={"sync": sync}))
+    with pytest.raises(NotSupportedError, match=said):
+        setup.cycle(drive, cycle, setup.TemporaryObjects(drive))
+    setup.cycle(drive, 0.006, setup.TemporaryObjects(drive))  # this one it can
+    assert node.dictionary.read(0x60C2, 1) == 6
+
+
+def test_a_drive_without_a_target_that_the_pdos_carry_is_refused(connected):
+    drive, node, _ = connected("prbt")
+    with pytest.raises(NotSupportedError, match="the drive has no target torque 0x6071"):
+        setup.process_data(drive, setup.TemporaryObjects(drive))
+    assert not node.nmt.operational
