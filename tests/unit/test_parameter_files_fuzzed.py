@@ -1,0 +1,129 @@
+"""Backups and journals that somebody changed, checksum included: refused in words, or harmless."""
+
+import copy
+from contextlib import suppress
+
+import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from drives.errors import ProfileError
+from drives.objects import ObjectAddress, ObjectInfo
+from drives.parameters import (
+    Backup,
+    DriveBackup,
+    DriveRecord,
+    HeldObject,
+    Journal,
+    JournalEntry,
+    Storing,
+    load_backup,
+    load_journal,
+    save_backup,
+    save_journal,
+)
+from drives.parameters.backup import checksum
+
+INFO = ObjectInfo(ObjectAddress(0x2010, 1), "REAL32", "gain")
+TEXT = ObjectInfo(ObjectAddress(0x2011), "VISIBLE_STRING", "label")
+STRANGE = st.one_of(
+    st.none(),
+    st.booleans(),
+    st.integers(-(2**70), 2**70),
+    st.floats(),
+    st.text(st.characters(codec="ascii", exclude_categories=["Cc"]), max_size=12),
+    st.sampled_from(["0x6040", "0x2010:01", "UNSIGNED32", "REAL64", "open", "stored", "../a", ""]),
+    st.lists(st.integers(), max_size=2),
+    st.dictionaries(st.text(max_size=3), st.integers(), max_size=2),
+    st.dates(),
+    st.binary(max_size=4),
+)
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """A journal and a backup, as plain values."""
+    folder = tmp_path_factory.mktemp("files")
+    entries = (JournalEntry(INFO, 0.5, 1.5), JournalEntry(TEXT, "a", "b"))
+    record = DriveRecord("x", 5, 1, 2, 3, 4, entries)
+    journal = Journal("m", "2026-01-01", "b.yaml", Storing.ALL, (record,))
+    held = (HeldObject(INFO, 0.5), HeldObject(TEXT, "a"))
+    backup = Backup("m", "2026-01-01", (DriveBackup("x", 5, 1, 2, 4, 3, held),))
+    save_journal(journal, folder / "write-journal.yaml")
+    save_backup(backup, folder / "b.yaml")
+    return folder, [
+        yaml.safe_load((folder / name).read_text()) for name in ("write-journal.yaml", "b.yaml")
+    ]
+
+
+def places(value, where=()):
+    """Yield every place inside plain values."""
+    yield where
+    if isinstance(value, dict | list):
+        items = value.items() if isinstance(value, dict) else enumerate(value)
+        for key, part in items:
+            yield from places(part, (*where, key))
+
+
+def changed(data, where, new, how):
+    """Return a copy with one place replaced, taken out, or doubled."""
+    data = copy.deepcopy(data)
+    inside = data
+    for key in where[:-1]:
+        inside = inside[key]
+    if how == "replace":
+        inside[where[-1]] = new
+    elif how == "remove":
+        del inside[where[-1]]
+    elif isinstance(inside, list):
+        inside.append(copy.deepcopy(inside[where[-1]]))
+    else:
+        inside[f"{where[-1]}-2"] = new
+    return data
+
+
+@settings(max_examples=400, deadline=None)
+@given(st.data())
+def test_a_changed_file_is_refused_in_words_or_is_whole(files, data):
+    folder, originals = files
+    which = data.draw(st.integers(0, 1))
+    original = originals[which]
+    where = data.draw(st.sampled_from([w for w in places(original) if w]))
+    how = data.draw(st.sampled_from(["replace", "remove", "double"]))
+    plain = changed(original, where, data.draw(STRANGE), how)
+    try:
+        body = {k: v for k, v in plain.items() if k not in ("format", "checksum")}
+        plain["checksum"] = checksum(plain.get("drives") if which else body)
+        text = yaml.safe_dump(plain, sort_keys=False)
+    except (yaml.YAMLError, TypeError, ValueError):
+        return  # no YAML can say it
+    path = folder / "changed.yaml"
+    path.write_text(text, encoding="utf-8")
+    try:
+        if which:
+            loaded = load_backup(path)
+            values = [(h.info, h.value) for d in loaded.drives for h in d.held]
+            assert all(isinstance(d.node_id, int) for d in loaded.drives)
+        else:
+            journal = load_journal(path)
+            assert "/" not in journal.backup
+            entries = [e for d in journal.drives for e in d.entries]
+            values = [(e.info, v) for e in entries for v in (e.before, e.after)]
+    except ProfileError:
+        return
+    for info, value in values:
+        info.encode(value)
+        assert isinstance(value, str) == (info.type == "VISIBLE_STRING")
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.binary(max_size=300), st.integers(0, 10_000), st.integers(0, 1))
+def test_noise_in_a_file_is_refused_in_words(files, noise, at, which):
+    folder, _ = files
+    whole = (folder / ("b.yaml" if which else "write-journal.yaml")).read_bytes()
+    at %= len(whole)
+    path = folder / "noise.yaml"
+    path.write_bytes(whole[:at] + noise + whole[at + len(noise) :])
+    with suppress(ProfileError):  # and nothing else
+        load_backup(path) if which else load_journal(path)
