@@ -1,0 +1,1 @@
+"""Criticism: what the simulation of a machine gets wrong, why, and what is gained by knowing."""

@@ -1,0 +1,201 @@
+"""Friction between a mass and ground: viscous, dry, Stribeck, and with a direction.
+
+Dry friction at the motor is a spring in series with a slider (Jenkins element): at rest it takes what
+there is, up to its limit, and after a turn it grows over the presliding distance.  Its limit is reached
+within the rounding velocity, limit tanh(abs(v) / rounding), for lubricated contacts do not
+jump.  In rows in which the axis may stand still nothing is compared: there friction is not known.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from fieldtool.criticise.effects.base import Context, Effect, FloatArray, Parameter, Values
+from fieldtool.criticise.simulate.kernels import slider
+from fieldtool.criticise.simulate.motion import Motion
+from fieldtool.criticise.simulate.structure import Element, Law, Structure
+
+TURNS = ((1e-5, 1e-3), (1e-5, 0.03), (1e-3, 1e-3), (1e-2, 1e-3))
+"""Start values: presliding distance over the travel, rounding velocity over the fastest."""
+SLOWEST = (0.05, 0.15, 0.4)
+"""Shares of the fastest velocity, as start values of the Stribeck velocity."""
+
+
+class ViscousFriction(Effect):
+    """A torque in proportion to the velocity of the first or last mass."""
+
+    name = "viscous_friction"
+    equation = "tau = coefficient v"
+    source = "Newton's law of viscosity; Armstrong-Helouvry et al., Automatica 30, 1994"
+    signature = "torque in phase with the velocity, linear, at all speeds"
+    contrary = "odd harmonics of a sine; a step where the velocity changes its sign"
+
+    def structure(self, structure: Structure, values: Values) -> Structure:
+        """Add to the damping of the mass."""
+        damping = structure.damping.copy()
+        ends = structure.motors if self.location == "motor" else structure.ends
+        damping[ends[self.axis], ends[self.axis]] += values["coefficient"]
+        return replace(structure, damping=damping)
+
+
+class CoulombFriction(Effect):
+    """A constant torque against the motion."""
+
+    name = "coulomb_friction"
+    equation = "tau = torque sign(v); at rest up to torque"
+    source = "Coulomb 1785; presliding: Jenkins 1962 (spring and slider)"
+    signature = "torque that follows the sign of the velocity and not its size; odd harmonics"
+    contrary = "even harmonics; growth with the amplitude"
+
+    def torque(self, motion: Motion, values: Values) -> FloatArray | None:
+        """At the motor."""
+        if self.location != "motor":
+            return None
+        limit = values["torque"] * _rounded(motion, self.axis, values)
+        position = np.ascontiguousarray(motion.smooth_position[:, self.axis])
+        return _signed_slider(position, limit, limit, values["presliding"])
+
+    def structure(self, structure: Structure, values: Values) -> Structure:
+        """At the last mass, rounded around standstill."""
+        if self.location == "motor":
+            return structure
+        dry = (values["torque"], values["rounding"], 0.0)
+        return structure.with_elements(Element(Law.DRY, int(structure.ends[self.axis]), -1, dry))
+
+
+class StribeckFriction(Effect):
+    """Dry friction that falls from breakaway to sliding as the axis gets faster."""
+
+    name = "stribeck_friction"
+    equation = "tau = (torque + (breakaway - torque) exp(-(v / velocity)^2)) sign(v)"
+    source = "Stribeck 1902; Bo and Pavelescu, Wear 82, 1982 (exponent 2)"
+    signature = "follows the sign of the velocity, and is larger at low speed than at high speed"
+    contrary = "a torque that is the same at all speeds; even harmonics"
+
+    def torque(self, motion: Motion, values: Values) -> FloatArray | None:
+        """At the motor; the parameter ``extra`` is breakaway less sliding friction."""
+        speed = motion.smooth_velocity[:, self.axis] / values["velocity"]
+        limit = values["torque"] + values["extra"] * np.exp(-(speed**2))
+        limit = limit * _rounded(motion, self.axis, values)
+        position = np.ascontiguousarray(motion.smooth_position[:, self.axis])
+        return _signed_slider(position, limit, limit, values["presliding"])
+
+    def plain(self, values: Values) -> dict[str, tuple[float, str, tuple[str, ...]]]:
+        """Breakaway as a whole, as it is usually stated."""
+        out = super().plain(values)
+        unit = out.pop("extra")[1]
+        out["breakaway"] = (values["torque"] + values["extra"], unit, ("torque", "extra"))
+        return out
+
+
+class AsymmetricFriction(Effect):
+    """Dry and viscous friction that differ between the directions of motion."""
+
+    name = "asymmetric_friction"
+    equation = "tau = coulomb+ + viscous+ v for v > 0, -coulomb- + viscous- v for v < 0"
+    source = "Janot, Gautier, Brunot, EMPS reference models, 2019"
+    signature = "follows the sign of the velocity, with another size in either direction"
+    contrary = "the same torque in both directions"
+
+    def torque(self, motion: Motion, values: Values) -> FloatArray | None:
+        """At the motor."""
+        velocity = motion.smooth_velocity[:, self.axis]
+        rounded = _rounded(motion, self.axis, values)
+        position = np.ascontiguousarray(motion.smooth_position[:, self.axis])
+        dry = _signed_slider(
+            position,
+            values["coulomb_positive"] * rounded,
+            values["coulomb_negative"] * rounded,
+            values["presliding"],
+        )
+        moving = motion.velocity[:, self.axis]
+        wet = np.where(velocity > 0, values["viscous_positive"], values["viscous_negative"])
+        return np.asarray(dry + wet * moving, dtype=np.float64)
+
+
+def friction_candidates(context: Context) -> list[Effect]:
+    """Return every kind of friction on every axis, with start values from travel and speed."""
+    out: list[Effect] = []
+    for axis in range(len(context.axes)):
+        torque, size = context.torque_unit(axis), context.torque_size(axis)
+        fastest, travel = context.fastest(axis), context.travel(axis)
+        if fastest <= 0.0 or travel <= 0.0:
+            continue
+        wet = context.per(axis, "s")
+
+        def dry(name: str, size: float = size, unit: str = torque) -> Parameter:
+            return Parameter(name, unit, 0.0, 0.0, 10.0 * size, 0.1 * size, linear=True)
+
+        def viscous(name: str, fast: float = fastest, size: float = size, unit: str = wet) -> Parameter:
+            most = 10.0 * size / fast
+            return Parameter(name, unit, 0.0, -most, most, 0.1 * size / fast, linear=True)
+
+        places = ["motor"] + (["load"] if context.masses(axis) > 1 else [])
+        for place in places:
+            variable = "viscous_friction" if place == "motor" else "load_friction"
+            if f"{context.axes[axis].name}.{variable}" not in context.variable:
+                out.append(ViscousFriction(axis, (viscous("coefficient"),), place))
+        for share, slow_share in TURNS:
+            reach = Parameter(
+                "presliding", context.length_unit(axis), share * travel, 1e-6 * travel, 0.05 * travel,
+                0.3 * share * travel,
+            )  # fmt: skip
+            turn = Parameter(
+                "rounding", _speed_unit(context, axis), slow_share * fastest, 1e-4 * fastest,
+                0.1 * fastest, 0.3 * slow_share * fastest,
+            )  # fmt: skip
+            out.append(CoulombFriction(axis, (dry("torque"), reach, turn)))
+            both = ("coulomb_friction", "viscous_friction")
+            out.append(
+                AsymmetricFriction(
+                    axis,
+                    (
+                        dry("coulomb_positive"),
+                        dry("coulomb_negative"),
+                        viscous("viscous_positive"),
+                        viscous("viscous_negative"),
+                        reach,
+                        turn,
+                    ),
+                    replaces=both,
+                )
+            )
+            out.extend(
+                StribeckFriction(
+                    axis,
+                    (
+                        dry("torque"),
+                        dry("extra"),
+                        Parameter("velocity", _speed_unit(context, axis), slow * fastest,
+                                  0.005 * fastest, 0.7 * fastest, 0.3 * slow * fastest),
+                        reach,
+                        turn,
+                    ),
+                    replaces=("coulomb_friction",),
+                )  # fmt: skip
+                for slow in SLOWEST
+            )
+        if context.masses(axis) > 1:
+            rounding = Parameter(
+                "rounding", _speed_unit(context, axis), 0.02 * fastest, 0.002 * fastest,
+                0.2 * fastest, 0.01 * fastest,
+            )  # fmt: skip
+            out.append(CoulombFriction(axis, (dry("torque"), rounding), "load"))
+    return out
+
+
+def _speed_unit(context: Context, axis: int) -> str:
+    return f"{context.length_unit(axis)}/s"
+
+
+def _signed_slider(
+    position: FloatArray, forward: FloatArray, backward: FloatArray, reach: float
+) -> FloatArray:
+    """Return the slider's force, linear in its limits: a negative mean limit turns it round."""
+    sign = 1.0 if float(np.mean(forward + backward)) >= 0 else -1.0
+    return sign * slider(position, sign * forward, sign * backward, reach)
+
+
+def _rounded(motion: Motion, axis: int, values: Values) -> FloatArray:
+    speed = np.abs(motion.smooth_velocity[:, axis])
+    return np.asarray(np.tanh(speed / values["rounding"]), dtype=np.float64)

@@ -1,0 +1,176 @@
+"""What stands between the torque that acts and the torque that the drive reports, and delays."""
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.ndimage import maximum_filter, median_filter
+from scipy.signal import lfilter
+
+from fieldtool.criticise.effects.base import Context, Effect, FloatArray, Parameter, Values
+from fieldtool.criticise.simulate.motion import FIRST, Motion, differentiate
+
+LONGEST = 0.02
+"""s: no delay or lag of a drive is longer."""
+FEWEST_CYCLES = 8.0
+"""Of a disturbance within the shortest experiment."""
+STANDS_OUT = 12.0
+"""Power of a line over the median of those around it, from which it is tried as a disturbance."""
+AROUND = 12
+CLIPPED = (0.95, 0.85, 0.7, 0.5)
+"""Start values of the limit over the largest torque."""
+
+
+class TorqueScale(Effect):
+    """A torque that is reported larger or smaller than it is."""
+
+    name = "torque_scale"
+    equation = "reported = true / scale"
+    source = "torque constant of the motor; Krause, Analysis of Electric Machinery, 2002"
+    signature = "all of an axis' masses, springs and dampers off by one factor, its neighbours' not"
+    contrary = "one mass or spring alone that is off"
+
+    def reported(self, torque: FloatArray, motion: Motion, values: Values) -> FloatArray:
+        """Divide by the scale."""
+        return torque / values["scale"]
+
+
+class TorqueLag(Effect):
+    """A torque that follows what the drive reports only after a first-order lag."""
+
+    name = "torque_lag"
+    equation = "true + time true' = reported"
+    source = "current loop as a first-order lag; Leonhard, Control of Electrical Drives, 2001"
+    signature = "phase that falls and a gain that falls with the frequency; linear"
+    contrary = "a delay, whose gain is one at all frequencies; harmonics"
+
+    def reported(self, torque: FloatArray, motion: Motion, values: Values) -> FloatArray:
+        """Report what has to be asked for; a negative time: the report itself lags."""
+        time = values["time"]
+        if time >= 0.0:
+            return torque + time * differentiate(torque, FIRST, motion.step)
+        pole = float(np.exp(motion.step / time))
+        # A straight line between samples through a first-order lag, exactly.
+        late = 1.0 + (1.0 - pole) * time / motion.step
+        early = 1.0 - pole - late
+        out: FloatArray = lfilter([late, early], [1.0, -pole], torque - torque[0]) + torque[0]
+        return out
+
+
+class MeasurementDelay(Effect):
+    """A position that is measured later than the torque of the same row."""
+
+    name = "measurement_delay"
+    equation = "measured(t) = q(t - delay)"
+    source = "sampling and transmission; Franklin, Powell, Workman, Digital Control, 1998"
+    signature = "a phase in proportion to the frequency, with a gain of one; linear"
+    contrary = "harmonics; dependence on amplitude or direction"
+
+    def motion(self, motion: Motion, values: Values) -> Motion:
+        """Shift the motion of the axis to when it was, by Lagrange interpolation."""
+        shift = values["delay"] / motion.step
+        columns = {
+            name: _shifted(getattr(motion, name), self.axis, shift)
+            for name in ("position", "velocity", "acceleration", "smooth_position", "smooth_velocity")
+        }
+        return replace(motion, **columns)
+
+
+class TorqueSaturation(Effect):
+    """A torque that stays at a limit while the drive reports more."""
+
+    name = "torque_saturation"
+    equation = "true = max(-limit, min(limit, reported))"
+    source = "current or voltage limit of the drive; Hippe, Windup in Control, 2006"
+    signature = "an error only where the reported torque is large, of its sign; odd harmonics"
+    contrary = "an error at small torques"
+
+    def reported(self, torque: FloatArray, motion: Motion, values: Values) -> FloatArray:
+        """Add what the drive reported beyond the limit."""
+        asked = motion.torque[:, self.axis]
+        limit = values["limit"]
+        return torque + asked - np.clip(asked, -limit, limit)
+
+
+class PeriodicDisturbance(Effect):
+    """A torque of one frequency in time, whatever the axis does."""
+
+    name = "periodic_disturbance"
+    equation = "tau = amplitude sin(2 pi frequency t + phase), a phase of its own in each experiment"
+    source = "a neighbour's drive, a pump, the mains; Bodson, Adaptive Algorithms, 2005"
+    signature = "one line of the spectrum at the same frequency in all experiments"
+    contrary = "a frequency that goes with the speed or the period of the excitation"
+
+    def unknown(self, motion: Motion, values: Values) -> tuple[FloatArray, ...]:
+        """Return sine and cosine, of unknown size."""
+        phase = 2 * np.pi * values["frequency"] * motion.clock
+        return np.sin(phase), np.cos(phase)
+
+
+def torque_candidates(context: Context) -> list[Effect]:
+    """Return what may be wrong with the report of the torque, and with its time."""
+    out: list[Effect] = []
+    for axis in range(len(context.axes)):
+        time = {"unit": "s", "start": 0.0, "scale": 2e-4, "linear": True}
+        largest = context.largest_torque(axis)
+        out += [
+            MeasurementDelay(axis, (Parameter("delay", low=-LONGEST / 4, high=LONGEST, **time),)),  # type: ignore[arg-type]
+            TorqueLag(axis, (Parameter("time", low=-LONGEST, high=LONGEST, **time),)),  # type: ignore[arg-type]
+        ]
+        if len(context.axes) > 1:
+            out.append(TorqueScale(axis, (Parameter("scale", "1", 1.0, 0.2, 5.0, 0.02),)))
+        out += [
+            TorqueSaturation(
+                axis,
+                (Parameter("limit", context.torque_unit(axis), share * largest, 0.3 * largest,
+                           1.05 * largest, 0.02 * largest),),
+            )  # fmt: skip
+            for share in CLIPPED
+        ]
+    return out
+
+
+def disturbance_candidates(context: Context) -> list[Effect]:
+    """Return single frequencies at which the error stands out of those around it, in all experiments."""
+    out: list[Effect] = []
+    longest = max(context.motions, key=lambda m: m.rows)
+    shortest = min(m.rows * m.step for m in context.motions)
+    grid = np.fft.rfftfreq(longest.rows, longest.step)
+    width = 1.0 / (longest.rows * longest.step)
+    inside = (grid > FEWEST_CYCLES / shortest) & (grid < context.top)
+    if not inside.any():
+        return out
+    for axis in range(len(context.axes)):
+        level = np.full(int(inside.sum()), np.inf)
+        for motion, error in zip(context.motions, context.errors, strict=True):
+            power = np.abs(np.fft.rfft(error[:, axis] * np.hanning(motion.rows))) ** 2
+            floor = median_filter(power, size=2 * AROUND + 1, mode="nearest")
+            ratio = power / np.maximum(floor, 1e-300)
+            frequency = np.fft.rfftfreq(motion.rows, motion.step)
+            # The peak may lie between two lines of a shorter experiment.
+            ratio = maximum_filter(ratio, size=3, mode="nearest")
+            level = np.minimum(level, np.interp(grid[inside], frequency, ratio))
+        for k in np.argsort(level)[::-1][:2]:
+            if level[k] > STANDS_OUT:
+                f = float(grid[inside][k])
+                number = Parameter("frequency", "Hz", f, f - 2 * width, f + 2 * width, 0.1 * width)
+                out.append(PeriodicDisturbance(axis, (number,)))
+    return out
+
+
+def _shifted(values: FloatArray, axis: int, shift: float) -> FloatArray:
+    """Return the columns with that of ``axis`` read so many rows later, by six-point Lagrange polynomials."""
+    whole = int(np.floor(shift))
+    part = shift - whole
+    nodes = np.arange(-2, 4)
+    weights = [
+        np.prod([(part - other) / (node - other) for other in nodes if other != node])
+        for node in nodes
+    ]
+    out = values.copy()
+    n = values.shape[0]
+    rows = np.arange(n)
+    column = np.zeros(n)
+    for node, weight in zip(nodes, weights, strict=True):
+        column += weight * values[np.clip(rows + whole + node, 0, n - 1), axis]
+    out[:, axis] = column
+    return out

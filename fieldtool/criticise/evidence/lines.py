@@ -1,0 +1,194 @@
+"""Errors of the torque as weighted lines of their spectrum, and back as courses in time.
+
+An error e (n, M) in the rows of one span becomes E(f) / sqrt(S(f)) at the lines of the band, S its
+noise; what is not known beforehand of each span (the hidden masses' first position and velocity)
+is projected out.  Measured and modelled torque thus pass the same filter.
+S comes from the lines between the harmonics and from the top of the band where the excitation is periodic,
+and from a white level and the noise of the position where it is not.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal.windows import tukey
+
+from fieldtool.criticise.evidence.spans import Span
+from fieldtool.criticise.simulate.inverse import dynamic_stiffness
+from fieldtool.criticise.simulate.motion import Motion, white_noise
+from fieldtool.criticise.simulate.structure import Structure
+
+FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+TAPER = 0.1
+"""Share of a span in which both its ends fade, where it is not periodic."""
+SMALL = 1e-4
+"""Of the torque at a line and around it: nothing smaller is believed (what happens between samples)."""
+UPPER = 0.4
+"""Share of the band, at its top, from whose lines noise is taken that repeats with the period."""
+AROUND = 12
+"""Lines to either side over which noise is averaged."""
+PART = 0.2
+"""Of the noise that comes from the position, from which a line has to stand out of it."""
+STANDS_OUT = 30.0
+"""Power of the torque over the noise at such a line."""
+LEAST_ROWS = 0.02
+"""Share of rows that count, below which an axis is left out of a span."""
+DEPENDENT = 1e-8
+"""Of the largest: columns that add less than this to the others are left out."""
+
+
+@dataclass(frozen=True, eq=False)
+class Lines:
+    """How errors in the rows of one span become numbers of variance one."""
+
+    span: Span
+    motion: Motion
+    window: FloatArray
+    """(n, M): taper times the rows that count."""
+    weight: FloatArray
+    """1 / sqrt(S), (L, M)."""
+    noise: FloatArray
+    """S, (L, M)."""
+    free: FloatArray
+    """Orthonormal columns that are projected out, (2 L M, F)."""
+
+    def raw(self, error: FloatArray) -> ComplexArray:
+        """Return the spectrum of an error of the whole experiment (n, M) at the lines, (L, M)."""
+        rows = error[self.span.start : self.span.stop]
+        spectrum = np.fft.rfft(rows * self.window, axis=0) / rows.shape[0]
+        return np.asarray(spectrum[: self.weight.shape[0]])
+
+    def weighted(self, error: FloatArray) -> FloatArray:
+        """Return the weighted lines of an error, real and imaginary parts, (2 L M,)."""
+        return flat(self.raw(error) * self.weight)
+
+    def projected(self, values: FloatArray) -> FloatArray:
+        """Take out of (2 L M, ...) what is not known beforehand."""
+        return values - self.free @ (self.free.T @ values)
+
+    def in_time(self, values: FloatArray) -> FloatArray:
+        """Return weighted lines (2 L M,) as courses in time, (N, M), with the same sum of squares."""
+        lines = unflat(values, self.weight.shape[1])
+        spectrum = np.zeros((lines.shape[0] + 1, lines.shape[1]), dtype=complex)
+        spectrum[:-1] = lines
+        course = np.fft.irfft(spectrum, axis=0)
+        return np.asarray(course * np.sqrt(course.shape[0] / 2.0), dtype=np.float64)
+
+
+def flat(lines: ComplexArray) -> FloatArray:
+    """(L, M) complex as (2 L M,) real."""
+    return np.concatenate([lines.real.ravel(), lines.imag.ravel()])
+
+
+def unflat(values: FloatArray, axes: int) -> ComplexArray:
+    """Inverse of :func:`flat`."""
+    half = values.size // 2
+    return np.asarray((values[:half] + 1j * values[half:]).reshape(-1, axes))
+
+
+def lines_of(
+    span: Span,
+    motion: Motion,
+    error: FloatArray,
+    top: float,
+    structure: Structure,
+    unknown: Sequence[FloatArray],
+) -> Lines:
+    """Find noise and weights of one span.
+
+    Parameters
+    ----------
+    span, motion
+    error : ndarray
+        Torque measured less simulated, (n, M), of the whole experiment.
+    top : float
+        Hz.
+    structure : Structure
+        Says what noise of the position does to the torque.
+    unknown : sequence of ndarray
+        Courses (n, M) of what is not known beforehand.
+    """
+    n, M = span.stop - span.start, motion.position.shape[1]
+    taper = np.ones(n) if span.periods else tukey(n, TAPER)
+    window = taper[:, None] * motion.counted[span.start : span.stop]
+    count = max(8, int(top * n * motion.step))
+    ones = np.ones((count, M))
+    shape = Lines(span, motion, window, ones, ones, np.zeros((2 * count * M, 0)))
+    lines = _less(shape, error, unknown)
+    frequency = np.arange(count) / (n * motion.step)
+    white = white_noise(motion.position[span.start : span.stop])
+    share = np.mean(window**2, axis=0)
+    stiff = np.abs(dynamic_stiffness(structure, 2 * np.pi * frequency)) ** 2
+    moved = stiff @ white**2 * share / n
+    if span.periods > 1:
+        noise = np.maximum(_between_harmonics(lines, span.periods), _repeated(lines, moved, span.periods))
+    else:
+        noise = _level(lines)
+    torque = np.abs(shape.raw(motion.torque)) ** 2
+    floor = SMALL**2 * _averaged(torque, AROUND) + 1e-20 * torque.max(axis=0)
+    noise = np.maximum(noise, 0.25 * moved) + floor + np.finfo(float).tiny ** 0.5
+    # Where the motion is little but noise, a model that asks for less torque would seem the better one.
+    drowned = (moved > PART * noise) & (torque < STANDS_OUT * noise)
+    still = share < LEAST_ROWS
+    weight = np.where(still | drowned, 0.0, 1.0 / np.sqrt(noise))
+    stacked = np.zeros((2 * weight.size, 0))
+    if unknown:
+        stacked = np.column_stack([flat(shape.raw(c) * weight) for c in unknown])
+    return Lines(span, motion, window, weight, noise, _orthonormal(stacked))
+
+
+def _less(shape: Lines, error: FloatArray, unknown: Sequence[FloatArray]) -> ComplexArray:
+    """Lines of an error less what is not known beforehand, all lines counted alike."""
+    lines = shape.raw(error)
+    if not unknown:
+        return lines
+    free = _orthonormal(np.column_stack([flat(shape.raw(c)) for c in unknown]))
+    values = flat(lines)
+    return unflat(values - free @ (free.T @ values), lines.shape[1])
+
+
+def _orthonormal(columns: FloatArray) -> FloatArray:
+    size = np.linalg.norm(columns, axis=0)
+    columns = columns[:, size > 0] / size[size > 0]
+    if not columns.shape[1]:
+        return columns
+    u, s, _ = np.linalg.svd(columns, full_matrices=False)
+    return np.asarray(u[:, s > DEPENDENT * s[0]])
+
+
+def _between_harmonics(lines: ComplexArray, periods: int) -> FloatArray:
+    """Noise at each line from those around it that are no multiples of the period's, (L, M)."""
+    between = np.arange(lines.shape[0]) % periods != 0
+    power = np.abs(lines) ** 2
+    out = np.empty_like(power)
+    places = np.flatnonzero(between)
+    for k in range(lines.shape[0]):
+        near = np.searchsorted(places, k)
+        chosen = places[max(0, near - AROUND) : near + AROUND]
+        out[k] = np.median(power[chosen], axis=0) / np.log(2.0)
+    return out
+
+
+def _repeated(lines: ComplexArray, moved: FloatArray, periods: int) -> FloatArray:
+    """Noise that repeats with the period (rounding of signals that repeat), (M,).
+
+    It shows at the harmonics in the upper part of the band, where little is excited.
+    """
+    numbers = np.arange(lines.shape[0])
+    upper = (numbers >= lines.shape[0] * (1.0 - UPPER)) & (numbers % periods == 0)
+    power = np.maximum(np.abs(lines[upper]) ** 2 - moved[upper], 0.0)
+    return np.asarray(np.median(power, axis=0) / np.log(2.0))
+
+
+def _level(lines: ComplexArray) -> FloatArray:
+    """One level for all lines, from the power that the error has in the band, (L, M)."""
+    power = np.abs(lines) ** 2
+    return np.broadcast_to(power.mean(axis=0), power.shape).copy()
+
+
+def _averaged(power: FloatArray, reach: int) -> FloatArray:
+    kernel = np.ones(2 * reach + 1) / (2 * reach + 1)
+    padded = np.pad(power, [(reach, reach), (0, 0)], mode="edge")
+    return np.column_stack([np.convolve(c, kernel, mode="valid") for c in padded.T])

@@ -1,0 +1,235 @@
+"""Fit a hypothesis to the rows that may be seen, by Gauss-Newton steps with damping."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fieldtool.criticise.effects.base import Parameter
+from fieldtool.criticise.search.hypothesis import Hypothesis, Simulator
+
+FloatArray = NDArray[np.float64]
+STEPS = 12
+"""Most Gauss-Newton steps."""
+ENOUGH = 1e-4
+"""Relative gain of a step from which it is the last."""
+TRIES = 6
+"""Dampings tried a step."""
+LARGEST_FACTOR = 3.0
+DERIVATIVE = 1e-3
+"""Step of a derivative over the size of the number."""
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """A fitted hypothesis."""
+
+    hypothesis: Hypothesis
+    cost: float
+    """Sum of squares of the weighted errors that were seen."""
+    names: tuple[str, ...]
+    """Of all free numbers: those of the machine, then ``EFFECT@AXIS.PARAMETER``."""
+    values: FloatArray
+    std: FloatArray
+    """Standard errors, scaled by the misfit."""
+    covariance: FloatArray
+
+    def of_effect(self, place: int) -> Mapping[str, tuple[float, float]]:
+        """Return value and standard error of each free number of one effect."""
+        effect = self.hypothesis.effects[place]
+        lead = f"{place}:{effect.name}."
+        return {
+            name.removeprefix(lead): (float(v), float(s))
+            for name, v, s in zip(self.names, self.values, self.std, strict=True)
+            if name.startswith(lead)
+        }
+
+
+@dataclass(frozen=True)
+class _Free:
+    """One free number: of the machine (place -1) or of an effect."""
+
+    name: str
+    place: int
+    index: int
+    scale: float
+    known: float
+    """Standard error beforehand over the scale; infinite where nothing is known."""
+    parameter: Parameter | None
+
+
+def free_numbers(hypothesis: Hypothesis) -> list[_Free]:
+    """List the numbers that a fit may change."""
+    out = [
+        _Free(v.name, -1, k, v.scale, v.known, None)
+        for k, v in enumerate(hypothesis.machine.variables)
+        if v.name not in hypothesis.off
+    ]
+    for place, effect in enumerate(hypothesis.effects):
+        out += [
+            _Free(f"{place}:{effect.name}.{p.name}", place, k, p.scale, np.inf, p)
+            for k, p in enumerate(effect.parameters)
+            if p.scale > 0.0
+        ]
+    return out
+
+
+def vector_of(hypothesis: Hypothesis, free: list[_Free]) -> FloatArray:
+    """Return the values of the free numbers."""
+    return np.array(
+        [
+            hypothesis.base[f.index]
+            if f.parameter is None
+            else hypothesis.values[f.place][f.parameter.name]
+            for f in free
+        ]
+    )
+
+
+def with_vector(hypothesis: Hypothesis, free: list[_Free], vector: FloatArray) -> Hypothesis:
+    """Return the hypothesis with other values, within their bounds."""
+    base = hypothesis.base.copy()
+    values = [dict(v) for v in hypothesis.values]
+    for f, value in zip(free, vector, strict=True):
+        if f.parameter is None:
+            base[f.index] = value
+        else:
+            values[f.place][f.parameter.name] = f.parameter.clipped(float(value))
+    base = hypothesis.machine.clipped(base)
+    for k, name in enumerate(hypothesis.machine.names):
+        if name in hypothesis.off:
+            base[k] = 0.0
+    return replace(hypothesis, base=base, values=tuple(values))
+
+
+def fit(
+    simulator: Simulator,
+    hypothesis: Hypothesis,
+    steps: int = STEPS,
+    shared: FloatArray | None = None,
+) -> Fitted:
+    """Fit all free numbers to the rows of role ``fit``.
+
+    Parameters
+    ----------
+    simulator : Simulator
+    hypothesis : Hypothesis
+        Start values.
+    steps : int
+        Most steps.
+    shared : ndarray
+        Derivatives with respect to the machine's numbers at a hypothesis nearby, (rows, all variables): taken
+        for the first steps, which saves most of the time.
+    """
+    free = free_numbers(hypothesis)
+    scales = np.array([f.scale for f in free])
+    known = np.array([1.0 / f.known for f in free])
+    current = hypothesis
+    vector = vector_of(current, free)
+    origin = vector_of(
+        replace(hypothesis, base=hypothesis.machine.start), free
+    )
+    r = simulator.residual(current, "fit")
+    cost = float(r @ r)
+    damping, jacobian = 1e-6, np.zeros((r.size, len(free)))
+    fresh = shared is None
+    for turn in range(steps):
+        jacobian = derivatives(simulator, current, free, r, None if fresh else shared)
+        rows = np.vstack([jacobian, np.diag(known)])
+        side = np.concatenate([r, known * (vector - origin) / scales])
+        before = cost + float(np.sum((known * (vector - origin) / scales) ** 2))
+        size = np.linalg.norm(rows, axis=0)
+        size[size == 0.0] = 1.0
+        u, s, vt = np.linalg.svd(rows / size, full_matrices=False)
+        projected = u.T @ side
+        better = False
+        for _ in range(TRIES):
+            move = -(vt.T @ (s / (s**2 + damping) * projected)) / size
+            tried = with_vector(current, free, _limited(free, vector, scales * move))
+            if not tried.machine.physical(tried.base):
+                damping = max(10 * damping, 1e-6)
+                continue
+            reached = vector_of(tried, free)
+            r_tried = simulator.residual(tried, "fit")
+            after = float(r_tried @ r_tried)
+            total = after + float(np.sum((known * (reached - origin) / scales) ** 2))
+            if np.isfinite(total) and total < before:
+                better = True
+                break
+            damping = max(10 * damping, 1e-6)
+        if not better:
+            if fresh:
+                break
+            fresh, damping = True, 1e-6
+            continue
+        gained = (before - total) / max(before, 1e-300)
+        current, vector, r, cost = tried, reached, r_tried, after
+        damping = max(damping / 10, 1e-9)
+        if gained < ENOUGH and (fresh or turn >= 1):
+            break
+    return _result(current, free, vector, scales, jacobian, known, cost)
+
+
+def _limited(free: list[_Free], vector: FloatArray, move: FloatArray) -> FloatArray:
+    """Let no number that bends the torque become more than thrice, or less than a third, of itself."""
+    moved = vector + move
+    for k, f in enumerate(free):
+        if f.parameter is not None and not f.parameter.linear and f.parameter.low >= 0.0:
+            moved[k] = min(max(moved[k], vector[k] / LARGEST_FACTOR), vector[k] * LARGEST_FACTOR)
+    return moved
+
+
+def derivatives(
+    simulator: Simulator,
+    hypothesis: Hypothesis,
+    free: list[_Free],
+    r: FloatArray,
+    shared: FloatArray | None,
+) -> FloatArray:
+    """Return the change of the weighted errors per size of each free number, (rows, P)."""
+    vector = vector_of(hypothesis, free)
+    columns = []
+    for k, f in enumerate(free):
+        if f.parameter is None and shared is not None:
+            columns.append(shared[:, f.index])
+            continue
+        step = DERIVATIVE * f.scale
+        if f.parameter is not None and vector[k] + step > f.parameter.high:
+            step = -step
+        moved = vector.copy()
+        moved[k] += step
+        tried = with_vector(hypothesis, free, moved)
+        columns.append((simulator.residual(tried, "fit") - r) / (step / f.scale))
+    return np.column_stack(columns)
+
+
+def machine_derivatives(simulator: Simulator, hypothesis: Hypothesis) -> FloatArray:
+    """Return the derivatives with respect to every variable of the machine, (rows, V)."""
+    bare = replace(hypothesis)
+    all_free = [
+        _Free(v.name, -1, k, v.scale, v.known, None) for k, v in enumerate(bare.machine.variables)
+    ]
+    r = simulator.residual(bare, "fit")
+    return derivatives(simulator, bare, all_free, r, None)
+
+
+def _result(
+    hypothesis: Hypothesis,
+    free: list[_Free],
+    vector: FloatArray,
+    scales: FloatArray,
+    jacobian: FloatArray,
+    known: FloatArray,
+    cost: float,
+) -> Fitted:
+    rows = np.vstack([jacobian, np.diag(known)])
+    size = np.linalg.norm(rows, axis=0)
+    size[size == 0.0] = 1.0
+    _, s, vt = np.linalg.svd(rows / size, full_matrices=False)
+    inverse = (vt.T / np.maximum(s, 1e-9 * s[0]) ** 2) @ vt
+    level = cost / max(jacobian.shape[0] - len(free), 1)
+    shape = scales / size
+    covariance = level * inverse * np.outer(shape, shape)
+    std = np.sqrt(np.diag(covariance))
+    return Fitted(hypothesis, cost, tuple(f.name for f in free), vector, std, covariance)

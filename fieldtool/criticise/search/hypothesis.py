@@ -1,0 +1,161 @@
+"""A machine with some effects, and what it says of every experiment."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fieldtool.criticise.effects.base import Effect
+from fieldtool.criticise.evidence.lines import Lines, flat
+from fieldtool.criticise.evidence.spans import Role
+from fieldtool.criticise.search.machine import Machine
+from fieldtool.criticise.simulate.inverse import needed_torque
+from fieldtool.criticise.simulate.motion import Motion
+from fieldtool.criticise.simulate.structure import Structure
+
+FloatArray = NDArray[np.float64]
+KEPT = 48
+"""Simulations of the chains that are remembered."""
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """Values of the machine, and effects with theirs."""
+
+    machine: Machine
+    base: FloatArray
+    effects: tuple[Effect, ...] = ()
+    values: tuple[Mapping[str, float], ...] = ()
+
+    @cached_property
+    def off(self) -> frozenset[str]:
+        """Variables of the machine that stand still at zero: an effect contains them."""
+        names = self.machine.model.names
+        return frozenset(
+            f"{names[e.axis]}.{what}" for e in self.effects for what in e.replaces
+        ) & frozenset(self.machine.names)
+
+    def with_effect(self, effect: Effect) -> "Hypothesis":
+        """Add one effect at its start values; what it contains goes."""
+        kept = [
+            (e, v)
+            for e, v in zip(self.effects, self.values, strict=True)
+            if not (e.axis == effect.axis and e.name in effect.replaces)
+            and not (e.key == effect.key and e.name not in {"cogging", "encoder_error", "extra_mode"})
+        ]
+        start = {p.name: p.start for p in effect.parameters}
+        grown = replace(
+            self,
+            effects=(*(e for e, _ in kept), effect),
+            values=(*(v for _, v in kept), start),
+        )
+        base = self.base.copy()
+        for k, name in enumerate(self.machine.names):
+            if name in grown.off:
+                base[k] = 0.0
+        return replace(grown, base=base)
+
+    def without(self, place: int) -> "Hypothesis":
+        """Leave one effect out."""
+        less = replace(
+            self,
+            effects=self.effects[:place] + self.effects[place + 1 :],
+            values=self.values[:place] + self.values[place + 1 :],
+        )
+        base = self.base.copy()
+        for k, name in enumerate(self.machine.names):
+            if name in self.off - less.off:
+                base[k] = self.machine.variables[k].value
+        return replace(less, base=base)
+
+
+@dataclass(eq=False)
+class Simulator:
+    """Errors of hypotheses in the rows that are compared; remembers what it simulated."""
+
+    motions: Mapping[str, Motion]
+    lines: tuple[Lines, ...]
+
+    def __post_init__(self) -> None:
+        self._kept: dict[bytes, FloatArray] = {}
+
+    def errors(self, hypothesis: Hypothesis) -> dict[str, FloatArray]:
+        """Return the torque measured less simulated, (n, M), by experiment."""
+        return {name: m.torque - self.torque(hypothesis, m) for name, m in self.motions.items()}
+
+    def torque(self, hypothesis: Hypothesis, motion: Motion) -> FloatArray:
+        """Return the torque that the drives would report for the measured motion, (n, M)."""
+        pairs = list(zip(hypothesis.effects, hypothesis.values, strict=True))
+        moved = motion
+        chains = hypothesis.base[: -len(hypothesis.machine.model.axes)]
+        key = [motion.experiment.encode(), chains.tobytes()]
+        for effect, values in pairs:
+            other = effect.motion(moved, values)
+            if other is not moved:
+                key.append(repr((effect.key, sorted(values.items()))).encode())
+                moved = other
+        structure = Structure.of(hypothesis.machine.with_values(hypothesis.base))
+        for effect, values in pairs:
+            grown = effect.structure(structure, values)
+            if grown is not structure:
+                key.append(repr((effect.key, sorted(values.items()))).encode())
+                structure = grown
+        needed = self._remembered(b"|".join(key), structure, moved).copy()
+        for effect, values in pairs:
+            besides = effect.torque(moved, values)
+            if besides is not None:
+                needed[:, effect.axis] += besides
+        for effect, values in pairs:
+            needed[:, effect.axis] = effect.reported(needed[:, effect.axis], motion, values)
+        needed += hypothesis.machine.offsets(hypothesis.base)
+        return needed
+
+    def residual(self, hypothesis: Hypothesis, role: Role) -> FloatArray:
+        """Return the weighted error of all spans of one role, end to end."""
+        parts = self.parts(hypothesis, role)
+        return np.concatenate([values for _, values in parts]) if parts else np.zeros(0)
+
+    def parts(self, hypothesis: Hypothesis, role: Role) -> list[tuple[Lines, FloatArray]]:
+        """Return the weighted error of each span of one role."""
+        errors: dict[str, FloatArray] = {}
+        out = []
+        for lines in self.lines:
+            if lines.span.role != role:
+                continue
+            name = lines.span.experiment
+            if name not in errors:
+                motion = self.motions[name]
+                errors[name] = motion.torque - self.torque(hypothesis, motion)
+            values = lines.projected(lines.weighted(errors[name]))
+            out.append((lines, _without_unknown(hypothesis, lines, values)))
+        return out
+
+    def _remembered(self, key: bytes, structure: Structure, motion: Motion) -> FloatArray:
+        if key not in self._kept:
+            while len(self._kept) >= KEPT:
+                self._kept.pop(next(iter(self._kept)))
+            self._kept[key] = needed_torque(structure, motion)
+        return self._kept[key]
+
+
+def _without_unknown(hypothesis: Hypothesis, lines: Lines, values: FloatArray) -> FloatArray:
+    columns = []
+    for effect in hypothesis.effects:
+        if effect.name != "periodic_disturbance":
+            continue
+        place = hypothesis.effects.index(effect)
+        for course in effect.unknown(lines.motion, hypothesis.values[place]):
+            full = np.zeros_like(lines.motion.position)
+            full[:, effect.axis] = course
+            columns.append(lines.projected(flat(lines.raw(full) * lines.weight)))
+    if not columns:
+        return values
+    stacked = np.column_stack(columns)
+    size = np.linalg.norm(stacked, axis=0)
+    stacked = stacked[:, size > 0] / size[size > 0]
+    if not stacked.shape[1]:
+        return values
+    q, _ = np.linalg.qr(stacked)
+    return np.asarray(values - q @ (q.T @ values))

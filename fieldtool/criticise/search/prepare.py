@@ -1,0 +1,127 @@
+"""From a recording and a model to what can be fitted and tested."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fieldtool.criticise.effects.base import Context, band_limited
+from fieldtool.criticise.evidence.lines import Lines, lines_of
+from fieldtool.criticise.evidence.spans import Spans, spans_of, usable_experiments
+from fieldtool.criticise.search.hypothesis import Hypothesis, Simulator
+from fieldtool.criticise.search.machine import Machine
+from fieldtool.criticise.simulate.inverse import HiddenSystem
+from fieldtool.criticise.simulate.motion import Motion, motions_of
+from fieldtool.criticise.simulate.structure import Structure
+from fieldtool.errors import NotEnoughDataError
+from fieldtool.records.model import MachineModel
+from fieldtool.records.recording import AxisInfo, Recording
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """Everything that a search needs."""
+
+    recording: Recording
+    spans: Spans
+    motions: dict[str, Motion]
+    simulator: Simulator
+    start: Hypothesis
+
+    def context(self, hypothesis: Hypothesis) -> Context:
+        """Return what start values are taken from, with the errors that a hypothesis leaves."""
+        errors = self.simulator.errors(hypothesis)
+        motions = tuple(self.motions.values())
+        return Context(
+            self.recording.axes,
+            hypothesis.machine.with_values(hypothesis.base),
+            motions,
+            tuple(
+                band_limited(self.explained(errors[m.experiment], m), m.step, self.spans.top)
+                for m in motions
+            ),
+            self.spans.top,
+            self.spans.excited,
+            frozenset(hypothesis.machine.names),
+        )
+
+    def explained(self, error: FloatArray, motion: Motion) -> FloatArray:
+        """Count an error only where it is known, less its mean."""
+        counted = motion.counted
+        mean = np.sum(error * counted, axis=0) / np.maximum(counted.sum(axis=0), 1.0)
+        return np.asarray((error - mean) * counted)
+
+
+def prepare(recording: Recording, model: MachineModel, contiguous: bool = False) -> Prepared:
+    """Choose rows and band, differentiate the motion, find the noise.
+
+    Parameters
+    ----------
+    recording : Recording
+    model : MachineModel
+        Its chains, couplings and viscous frictions are what is criticised.
+    contiguous : bool
+        See :func:`fieldtool.criticise.evidence.spans.spans_of`.
+
+    Raises
+    ------
+    NotEnoughDataError
+        If there is nothing to compare, or the model is of other axes.
+    """
+    if model.names != recording.names:
+        raise NotEnoughDataError(
+            f"the model has the axes {', '.join(model.names)}, the recording "
+            f"{', '.join(recording.names)}: give a model of the same axes in the same order."
+        )
+    experiments = usable_experiments(recording)
+    spans = spans_of(recording, experiments, contiguous)
+    motions = {m.experiment: m for m in motions_of(recording, experiments, spans.top)}
+    largest = np.max([np.abs(m.torque).max(axis=0) for m in motions.values()], axis=0)
+    machine = Machine.of(model, largest)
+    start = Hypothesis(machine, machine.start)
+    prepared = Prepared(recording, spans, motions, Simulator(motions, ()), start)
+    return reweighted(prepared, start)
+
+
+def reweighted(prepared: Prepared, hypothesis: Hypothesis) -> Prepared:
+    """Return the same with the noise that is left by a hypothesis."""
+    model = hypothesis.machine.with_values(hypothesis.base)
+    system = HiddenSystem.of(Structure.of(model))
+    errors = prepared.simulator.errors(hypothesis)
+    free: dict[str, list[FloatArray]] = {}
+    lines: list[Lines] = []
+    for span in prepared.spans.spans:
+        motion = prepared.motions[span.experiment]
+        if span.experiment not in free and system.structure.hidden.size:
+            free[span.experiment] = list(system.free_torques(motion.step, motion.rows))
+        lines.append(
+            lines_of(
+                span,
+                motion,
+                errors[span.experiment],
+                prepared.spans.top,
+                system.structure,
+                _from(free.get(span.experiment, []), span.start),
+            )
+        )
+    simulator = Simulator(prepared.motions, tuple(lines))
+    return Prepared(
+        prepared.recording, prepared.spans, prepared.motions, simulator, prepared.start
+    )
+
+
+def _from(courses: list[FloatArray], start: int) -> list[FloatArray]:
+    """Free motions that begin at a row."""
+    out = []
+    for course in courses:
+        moved = np.zeros_like(course)
+        moved[start:] = course[: course.shape[0] - start]
+        out.append(moved)
+    return out
+
+
+def axes_of(prepared: Prepared) -> tuple[AxisInfo, ...]:
+    """Return what is known of the axes."""
+    return prepared.recording.axes

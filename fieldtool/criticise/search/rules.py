@@ -1,0 +1,126 @@
+"""When an effect may be given a name: the rules, and the words for why one was rejected."""
+
+from dataclasses import dataclass
+
+from fieldtool.criticise.effects.base import Context, Effect
+from fieldtool.criticise.search.fit import Fitted
+from fieldtool.criticise.search.significance import Comparison
+
+CHANCE = 1e-3
+"""Largest probability of the gain by chance; dozens of candidates are tried."""
+LEAST_SHARE = 0.04
+"""Of what is not explained yet (power, noise taken off): what one cause explains at least."""
+LEAST_SHARE_KNOWN = 0.15
+"""The same where the noise is known from repeated periods."""
+LEAST_TORQUE = 1e-3
+"""RMS of what a cause explains over that of the torque, below which it does not matter."""
+BEYOND_NOISE = 1.5
+"""Power of an axis' error over the noise, from which there is something to explain."""
+RELATED = 0.1
+"""A further effect of a family explains at least this of what the first one explained (RMS)."""
+KNOWN_WELL = 0.33
+"""Largest relative standard error of the number that says how strong a cause is."""
+ALIKE_T = 2.0
+"""Rivals whose difference on unseen data is below this many standard errors are a tie."""
+FAMILIES = (
+    frozenset({"viscous_friction", "coulomb_friction", "stribeck_friction", "asymmetric_friction"}),
+    frozenset({"backlash", "hardening_spring", "softening_spring", "structural_damping",
+               "stiffness_change"}),
+    frozenset({"measurement_delay", "torque_lag"}),
+    frozenset({"cogging", "encoder_error", "gravity"}),
+)  # fmt: skip
+STRENGTH = {
+    "viscous_friction": ("coefficient",),
+    "coulomb_friction": ("torque",),
+    "stribeck_friction": ("extra",),
+    "asymmetric_friction": ("coulomb_positive", "coulomb_negative", "viscous_positive",
+                            "viscous_negative"),
+    "backlash": ("half_gap",),
+    "hardening_spring": ("cubic",),
+    "softening_spring": ("cubic",),
+    "structural_damping": ("loss_factor",),
+    "gravity": ("sine", "cosine"),
+    "cogging": ("sine", "cosine"),
+    "torque_scale": ("scale",),
+    "torque_lag": ("time",),
+    "measurement_delay": ("delay",),
+    "encoder_error": ("sine", "cosine"),
+    "extra_mode": ("mass",),
+    "coupling_spring": ("stiffness",),
+    "coupling_inertia": ("inertia",),
+    "periodic_disturbance": (),
+    "stiffness_change": ("change",),
+    "torque_saturation": ("limit",),
+}  # fmt: skip
+"""The numbers of which at least one has to be known well."""
+
+
+def related(one: str, other: str) -> bool:
+    """Whether two effects are of one family, so that the form of one may look like the other."""
+    return one == other or any({one, other} <= family for family in FAMILIES)
+
+
+@dataclass(frozen=True)
+class Tried:
+    """One candidate, fitted, and what it does on unseen data."""
+
+    fitted: Fitted
+    effect: Effect
+    gain: Comparison
+    share: float
+    """Of the explainable power that was left before."""
+    torque: float
+    """RMS of what it explains over that of the axis' torque."""
+    beyond: float
+    """Power of the axis' error before, over that of the noise; infinite where it is not known."""
+
+    @property
+    def place(self) -> int:
+        """Index of the effect in the hypothesis."""
+        keys = [e.key for e in self.fitted.hypothesis.effects]
+        return len(keys) - 1 - keys[::-1].index(self.effect.key)
+
+
+def why_not(tried: Tried, context: Context, known_noise: bool, level: float) -> str:
+    """Return why a candidate gets no name, in words; empty if it may have one.
+
+    Parameters
+    ----------
+    tried : Tried
+    context : Context
+    known_noise : bool
+        Whether the noise is known from repeated periods.
+    level : float
+        RMS over that of the torque of what related effects explain already.
+    """
+    if tried.gain.p > CHANCE:
+        return "explains no more of the unseen data than chance would"
+    if tried.beyond < BEYOND_NOISE:
+        return "there is nothing beyond the noise that it could explain"
+    least = LEAST_SHARE_KNOWN if known_noise else LEAST_SHARE
+    if tried.share < least:
+        return f"explains only {100 * tried.share:.1f} % of what is left on unseen data"
+    if tried.torque < LEAST_TORQUE:
+        return f"explains {100 * tried.torque:.2g} % of the torque, which does not matter"
+    if tried.torque < RELATED * level:
+        return "explains no more than what the form of a related effect leaves"
+    return _unphysical(tried, context)
+
+
+def _unphysical(tried: Tried, context: Context) -> str:
+    effect, values = tried.effect, tried.fitted.hypothesis.values[tried.place]
+    numbers = tried.fitted.of_effect(tried.place)
+    for p in effect.parameters:
+        if p.scale <= 0.0 or p.name in ("presliding", "rounding"):
+            continue
+        close = 1e-6 * max(abs(p.high - p.low), 1e-300)
+        at_zero = p.low == 0.0 and values[p.name] <= close
+        if values[p.name] >= p.high - close or (values[p.name] <= p.low + close and not at_zero):
+            return f"its {p.name} would be at the edge of what is physical ({values[p.name]:.3g} {p.unit})"
+    strong = [n for n in STRENGTH[effect.name] if n in numbers]
+    if strong:
+        reference = 1.0 if effect.name == "torque_scale" else 0.0
+        errors = [numbers[n][1] / max(abs(numbers[n][0] - reference), 1e-300) for n in strong]
+        if not min(errors) <= KNOWN_WELL:
+            return f"its {strong[0]} can not be told from none"
+    return effect.implausible(values, context)

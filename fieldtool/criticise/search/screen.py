@@ -1,0 +1,148 @@
+"""What each candidate could gain, by its linear part: cheap, so that only the best are fitted in full."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fieldtool.criticise.effects.base import Effect
+from fieldtool.criticise.search.fit import machine_derivatives
+from fieldtool.criticise.search.hypothesis import Hypothesis, Simulator
+
+FloatArray = NDArray[np.float64]
+MOST_OF_IT = (0.0, 2.0)
+"""Bounds of how much of a start value's torque the data may ask for."""
+
+
+@dataclass(frozen=True, eq=False)
+class Screened:
+    """One candidate with better start values."""
+
+    effect: Effect
+    start: dict[str, float]
+    gain: float
+    """Expected fall of the sum of squares of the weighted errors that may be seen."""
+
+
+@dataclass(frozen=True, eq=False)
+class Tangent:
+    """A hypothesis and its derivatives."""
+
+    hypothesis: Hypothesis
+    residual: FloatArray
+    of_machine: FloatArray
+    """(rows, V), per scale of each variable."""
+    basis: FloatArray
+    """Orthonormal, spans what the machine's numbers can do; with rows for what is known of them."""
+    side: FloatArray
+    """The residual with the same rows, outside of the basis."""
+
+
+def tangent(simulator: Simulator, hypothesis: Hypothesis) -> Tangent:
+    """Linearise a hypothesis about its values."""
+    r = simulator.residual(hypothesis, "fit")
+    jacobian = machine_derivatives(simulator, hypothesis)
+    on = np.array([name not in hypothesis.off for name in hypothesis.machine.names])
+    known = np.array([1.0 / v.known for v in hypothesis.machine.variables])
+    rows = np.vstack([jacobian[:, on], np.diag(known[on])])
+    size = np.linalg.norm(rows, axis=0)
+    size[size == 0.0] = 1.0
+    basis, triangle = np.linalg.qr(rows / size)
+    basis = basis[:, np.abs(np.diag(triangle)) > 1e-10]  # noqa: PLR2004
+    side = np.concatenate([r, np.zeros(int(on.sum()))])
+    side = side - basis @ (basis.T @ side)
+    return Tangent(hypothesis, r, jacobian, basis, side)
+
+
+def screened(
+    simulator: Simulator,
+    at: Tangent,
+    candidates: Sequence[Effect],
+    advance: Callable[[float], None],
+) -> list[Screened]:
+    """Return the candidates by falling gain, for each place of each effect the best start only."""
+    best: dict[object, Screened] = {}
+    for k, effect in enumerate(candidates):
+        advance(k / max(len(candidates), 1))
+        one = _screen(simulator, at, effect)
+        if one is not None and (effect.key not in best or one.gain > best[effect.key].gain):
+            best[effect.key] = one
+    return sorted(best.values(), key=lambda s: -s.gain)
+
+
+def _screen(simulator: Simulator, at: Tangent, effect: Effect) -> Screened | None:
+    grown = at.hypothesis.with_effect(effect)
+    place = len(grown.effects) - 1
+    start = dict(grown.values[place])
+    if effect.unknown(next(iter(simulator.motions.values())), start):
+        r = simulator.residual(grown, "fit")
+        gain = float(at.residual @ at.residual - r @ r)
+        return Screened(effect, start, gain)
+    linear = [p for p in effect.parameters if p.linear]
+    # What an effect replaces is taken out of the residual it starts from.
+    r = simulator.residual(grown, "fit") if grown.off != at.hypothesis.off or len(
+        grown.effects
+    ) <= len(at.hypothesis.effects) else at.residual  # fmt: skip
+    columns, low, high = [], [], []
+    for p in linear:
+        values = [dict(v) for v in grown.values]
+        values[place][p.name] = p.scale
+        moved = Hypothesis(grown.machine, grown.base, grown.effects, tuple(values))
+        columns.append((simulator.residual(moved, "fit") - r) / p.scale)
+        low.append(p.low)
+        high.append(p.high)
+    if not linear:
+        column = simulator.residual(grown, "fit") - at.residual
+        lowest, highest = MOST_OF_IT
+        if effect.name == "torque_scale":
+            p = effect.parameters[0]
+            start[p.name] = p.start + 0.1 * p.scale
+            moved = Hypothesis(grown.machine, grown.base, grown.effects, (*grown.values[:-1], start))
+            column = (simulator.residual(moved, "fit") - at.residual) / (0.1 * p.scale)
+            lowest, highest = -0.5, 0.5
+        columns, low, high = [column], [lowest], [highest]
+    if not all(np.all(np.isfinite(c)) for c in columns):
+        return None
+    return _solved(at, effect, start, r, np.column_stack(columns), np.array(low), np.array(high))
+
+
+def _solved(
+    at: Tangent,
+    effect: Effect,
+    start: dict[str, float],
+    r: FloatArray,
+    columns: FloatArray,
+    low: FloatArray,
+    high: FloatArray,
+) -> Screened | None:
+    """Solve for the linear numbers beside the machine's; what leaves its bounds stays on them."""
+    more = at.basis.shape[0] - r.size
+    rows = np.vstack([columns, np.zeros((more, columns.shape[1]))])
+    rows -= at.basis @ (at.basis.T @ rows)
+    side = np.concatenate([r, np.zeros(more)])
+    side -= at.basis @ (at.basis.T @ side)
+    size = np.linalg.norm(rows, axis=0)
+    active = size > 1e-9 * max(float(np.linalg.norm(columns)), 1e-300)  # noqa: PLR2004
+    values = np.zeros(columns.shape[1])
+    for _ in range(columns.shape[1]):
+        if not active.any():
+            return None
+        solved = -np.linalg.lstsq(rows[:, active] / size[active], side, rcond=1e-10)[0]
+        values[:] = 0.0
+        values[active] = solved / size[active]
+        outside = (values < low) | (values > high)
+        if not outside.any():
+            break
+        active &= ~outside
+    values = np.clip(values, low, high)
+    left = side + rows @ values
+    # The gain is counted from what was there, with what the effect replaces still in place.
+    gain = float(at.side @ at.side - left @ left)
+    linear = [p.name for p in effect.parameters if p.linear]
+    start = dict(start)
+    if linear:
+        start |= dict(zip(linear, values.tolist(), strict=True))
+    elif effect.name == "torque_scale":
+        start[effect.parameters[0].name] = 1.0 + float(values[0])
+    return Screened(effect, start, gain)

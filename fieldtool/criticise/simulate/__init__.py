@@ -1,0 +1,1 @@
+"""Recordings simulated with a model: torque from the measured motion, motion from references."""

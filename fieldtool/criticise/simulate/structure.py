@@ -1,0 +1,101 @@
+"""Matrices of a machine to be simulated, and the elements of it that are not linear.
+
+Degrees of freedom run chain after chain, motor side first, as in
+:mod:`fieldtool.records.model`; masses that effects add come after them.
+"""
+
+from dataclasses import dataclass, field, replace
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fieldtool.records.model import MachineModel
+
+FloatArray = NDArray[np.float64]
+
+
+class Law(IntEnum):
+    """What an element does with its elongation s, its rate s' and the time t; force that pulls both ends together."""
+
+    CUBIC = 1
+    """p0 s**3."""
+    GAP = 2
+    """Takes away the spring p0 and the damper p1 while abs(s) < p2, and shortens s by p2 else."""
+    STEP = 3
+    """p0 s from the time p1 on."""
+    DRY = 4
+    """p0 tanh(s' / p1)."""
+
+
+@dataclass(frozen=True)
+class Element:
+    """A force between two masses, or between a mass and ground, beside the linear ones."""
+
+    law: Law
+    first: int
+    second: int
+    """-1 is ground."""
+    values: tuple[float, float, float]
+    """p0, p1, p2."""
+
+
+@dataclass(frozen=True)
+class Relaxation:
+    """A spring and a damper in series between two masses: a Maxwell branch."""
+
+    first: int
+    second: int
+    stiffness: float
+    """N m/rad or N/m."""
+    time: float
+    """Damper over spring, s."""
+
+
+@dataclass(frozen=True, eq=False)
+class Structure:
+    """M q'' + C q' + K q = torque + elements + branches."""
+
+    mass: FloatArray
+    """(n, n)."""
+    damping: FloatArray
+    stiffness: FloatArray
+    motors: NDArray[np.intp]
+    """(M,): degree of freedom of each motor."""
+    ends: NDArray[np.intp]
+    """(M,): of each chain's last mass."""
+    elements: tuple[Element, ...] = ()
+    branches: tuple[Relaxation, ...] = field(default=())
+
+    @classmethod
+    def of(cls, model: MachineModel) -> "Structure":
+        """Return the matrices of a model, without its effects."""
+        return cls(
+            model.mass_matrix,
+            model.damping_matrix,
+            model.stiffness_matrix,
+            model.first_masses,
+            model.last_masses,
+        )
+
+    @property
+    def hidden(self) -> NDArray[np.intp]:
+        """Degrees of freedom whose motion nobody measures, (H,)."""
+        return np.setdiff1d(np.arange(self.mass.shape[0]), self.motors).astype(np.intp)
+
+    def with_elements(self, *elements: Element) -> "Structure":
+        """Return the structure with further elements."""
+        return replace(self, elements=(*self.elements, *elements))
+
+    def with_mass(self, at: int, mass: float, stiffness: float, damping: float) -> "Structure":
+        """Return the structure with one more mass, on a spring and damper at a degree of freedom."""
+        size = self.mass.shape[0]
+        grown = [np.zeros((size + 1, size + 1)) for _ in range(3)]
+        for matrix, old in zip(grown, (self.mass, self.damping, self.stiffness), strict=True):
+            matrix[:size, :size] = old
+        grown[0][size, size] = mass
+        pair = np.ix_([at, size], [at, size])
+        ones = np.array([[1.0, -1.0], [-1.0, 1.0]])
+        grown[1][pair] += damping * ones
+        grown[2][pair] += stiffness * ones
+        return replace(self, mass=grown[0], damping=grown[1], stiffness=grown[2])
