@@ -51,6 +51,8 @@ class Effect:
     """What it must leave in the data."""
     contrary: ClassVar[str]
     """What it must not leave."""
+    shows: ClassVar[tuple[str, ...]] = ()
+    """Views of the error (:mod:`fieldtool.criticise.where.views`) of which one at least has to show it."""
 
     axis: int
     parameters: tuple[Parameter, ...]
@@ -109,6 +111,8 @@ class Context:
     """Frequency below which nearly all of the torque is, Hz."""
     variable: frozenset[str]
     """Names of the model's numbers that are fitted beside."""
+    fundamentals: tuple[tuple[float, float], ...] = ()
+    """Of periodic excitation: its lowest frequency, and the distance of lines that can be told apart, Hz."""
 
     def fastest(self, axis: int) -> float:
         """Speed that 1 % of the rows exceed, rad/s or m/s."""

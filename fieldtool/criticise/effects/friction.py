@@ -29,6 +29,7 @@ class ViscousFriction(Effect):
     source = "Newton's law of viscosity; Armstrong-Helouvry et al., Automatica 30, 1994"
     signature = "torque in phase with the velocity, linear, at all speeds"
     contrary = "odd harmonics of a sine; a step where the velocity changes its sign"
+    shows = ("speed",)
 
     def structure(self, structure: Structure, values: Values) -> Structure:
         """Add to the damping of the mass."""
@@ -46,6 +47,7 @@ class CoulombFriction(Effect):
     source = "Coulomb 1785; presliding: Jenkins 1962 (spring and slider)"
     signature = "torque that follows the sign of the velocity and not its size; odd harmonics"
     contrary = "even harmonics; growth with the amplitude"
+    shows = ("direction",)
 
     def torque(self, motion: Motion, values: Values) -> FloatArray | None:
         """At the motor."""
@@ -71,6 +73,7 @@ class StribeckFriction(Effect):
     source = "Stribeck 1902; Bo and Pavelescu, Wear 82, 1982 (exponent 2)"
     signature = "follows the sign of the velocity, and is larger at low speed than at high speed"
     contrary = "a torque that is the same at all speeds; even harmonics"
+    shows = ("speed",)
 
     def torque(self, motion: Motion, values: Values) -> FloatArray | None:
         """At the motor; the parameter ``extra`` is breakaway less sliding friction."""
@@ -96,6 +99,7 @@ class AsymmetricFriction(Effect):
     source = "Janot, Gautier, Brunot, EMPS reference models, 2019"
     signature = "follows the sign of the velocity, with another size in either direction"
     contrary = "the same torque in both directions"
+    shows = ("direction", "speed")
 
     def torque(self, motion: Motion, values: Values) -> FloatArray | None:
         """At the motor."""

@@ -26,6 +26,7 @@ class Gravity(Effect):
     source = "the torque of a weight on an arm; Khalil and Dombre, Modeling of Robots, 2002"
     signature = "torque that goes with the position, once a turn, at any speed"
     contrary = "growth with the speed; dependence on the direction"
+    shows = ("position", "own motion")
 
     def torque(self, motion: Motion, values: Values) -> FloatArray | None:
         """At the motor."""
@@ -49,6 +50,7 @@ class Cogging(Effect):
     source = "Hanselman, Brushless Motors, 2012 (cogging); order tracking as in vibration analysis"
     signature = "torque at one order of the position, the same at all speeds"
     contrary = "growth with the speed"
+    shows = ("position",)
 
     def torque(self, motion: Motion, values: Values) -> FloatArray | None:
         """At the motor."""
@@ -74,6 +76,7 @@ class EncoderError(Effect):
     source = "eccentricity and interpolation errors; Ellis, Control System Design Guide, 2012"
     signature = "torque at one order of the position that grows with the square of the speed"
     contrary = "the same torque at all speeds"
+    shows = ("position",)
 
     def motion(self, motion: Motion, values: Values) -> Motion:
         """Take the error off the measured position."""
@@ -113,7 +116,7 @@ def position_candidates(context: Context) -> list[Effect]:
             out.append(Gravity(axis, (wave("sine", most, unit), wave("cosine", most, unit))))
         per = "rad/m" if info.kind == "linear" else "1/turn"
         for kind, length, most in ((Cogging, unit, 5 * size), (EncoderError, info.position_unit, 0.02 * travel)):
-            for order in _peaks(context, axis, kind is EncoderError):
+            for order in waves(context, axis, kind is EncoderError):
                 low, high = 0.9 * order, 1.1 * order
                 number = Parameter("order", per, order, low, high, 0.1 * 2 * np.pi / travel)
                 pair = (wave("sine", most, length), wave("cosine", most, length))
@@ -121,7 +124,7 @@ def position_candidates(context: Context) -> list[Effect]:
     return out
 
 
-def _peaks(context: Context, axis: int, accelerated: bool) -> list[float]:
+def waves(context: Context, axis: int, accelerated: bool) -> list[float]:
     """Orders, 1/rad or 1/m, at which a wave over the position explains most of the error."""
     travel, fastest = context.travel(axis), context.fastest(axis)
     lowest = 2 * np.pi * FEWEST_WAVES / travel

@@ -16,6 +16,8 @@ FEWEST_CYCLES = 8.0
 STANDS_OUT = 12.0
 """Power of a line over the median of those around it, from which it is tried as a disturbance."""
 AROUND = 12
+OFF_HARMONICS = 0.6
+"""Lines from the harmonics of the excitation within which nothing is called a disturbance."""
 CLIPPED = (0.95, 0.85, 0.7, 0.5)
 """Start values of the limit over the largest torque."""
 
@@ -28,6 +30,7 @@ class TorqueScale(Effect):
     source = "torque constant of the motor; Krause, Analysis of Electric Machinery, 2002"
     signature = "all of an axis' masses, springs and dampers off by one factor, its neighbours' not"
     contrary = "one mass or spring alone that is off"
+    shows = ("own motion", "other axes")
 
     def reported(self, torque: FloatArray, motion: Motion, values: Values) -> FloatArray:
         """Divide by the scale."""
@@ -42,6 +45,7 @@ class TorqueLag(Effect):
     source = "current loop as a first-order lag; Leonhard, Control of Electrical Drives, 2001"
     signature = "phase that falls and a gain that falls with the frequency; linear"
     contrary = "a delay, whose gain is one at all frequencies; harmonics"
+    shows = ("own motion",)
 
     def reported(self, torque: FloatArray, motion: Motion, values: Values) -> FloatArray:
         """Report what has to be asked for; a negative time: the report itself lags."""
@@ -64,6 +68,7 @@ class MeasurementDelay(Effect):
     source = "sampling and transmission; Franklin, Powell, Workman, Digital Control, 1998"
     signature = "a phase in proportion to the frequency, with a gain of one; linear"
     contrary = "harmonics; dependence on amplitude or direction"
+    shows = ("own motion",)
 
     def motion(self, motion: Motion, values: Values) -> Motion:
         """Shift the motion of the axis to when it was, by Lagrange interpolation."""
@@ -83,6 +88,7 @@ class TorqueSaturation(Effect):
     source = "current or voltage limit of the drive; Hippe, Windup in Control, 2006"
     signature = "an error only where the reported torque is large, of its sign; odd harmonics"
     contrary = "an error at small torques"
+    shows = ("large torque",)
 
     def reported(self, torque: FloatArray, motion: Motion, values: Values) -> FloatArray:
         """Add what the drive reported beyond the limit."""
@@ -99,6 +105,7 @@ class PeriodicDisturbance(Effect):
     source = "a neighbour's drive, a pump, the mains; Bodson, Adaptive Algorithms, 2005"
     signature = "one line of the spectrum at the same frequency in all experiments"
     contrary = "a frequency that goes with the speed or the period of the excitation"
+    shows = ("one frequency",)
 
     def unknown(self, motion: Motion, values: Values) -> tuple[FloatArray, ...]:
         """Return sine and cosine, of unknown size."""
@@ -137,6 +144,10 @@ def disturbance_candidates(context: Context) -> list[Effect]:
     grid = np.fft.rfftfreq(longest.rows, longest.step)
     width = 1.0 / (longest.rows * longest.step)
     inside = (grid > FEWEST_CYCLES / shortest) & (grid < context.top)
+    for fundamental, spacing in context.fundamentals:
+        # On a harmonic of the excitation nobody can tell a disturbance from what was excited.
+        off = np.abs(grid - fundamental * np.rint(grid / fundamental))
+        inside &= off > OFF_HARMONICS * spacing
     if not inside.any():
         return out
     for axis in range(len(context.axes)):
@@ -152,7 +163,7 @@ def disturbance_candidates(context: Context) -> list[Effect]:
         for k in np.argsort(level)[::-1][:2]:
             if level[k] > STANDS_OUT:
                 f = float(grid[inside][k])
-                number = Parameter("frequency", "Hz", f, f - 2 * width, f + 2 * width, 0.1 * width)
+                number = Parameter("frequency", "Hz", f, f - 0.5 * width, f + 0.5 * width, 0.1 * width)
                 out.append(PeriodicDisturbance(axis, (number,)))
     return out
 

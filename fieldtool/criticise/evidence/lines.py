@@ -27,6 +27,8 @@ SMALL = 1e-4
 """Of the torque at a line and around it: nothing smaller is believed (what happens between samples)."""
 UPPER = 0.4
 """Share of the band, at its top, from whose lines noise is taken that repeats with the period."""
+MOST_REPEATED = 10.0
+"""Power of noise that repeats over that of noise that does not: what is more is no noise."""
 AROUND = 12
 """Lines to either side over which noise is averaged."""
 PART = 0.2
@@ -53,6 +55,8 @@ class Lines:
     """S, (L, M)."""
     free: FloatArray
     """Orthonormal columns that are projected out, (2 L M, F)."""
+    unknown: tuple[FloatArray, ...] = ()
+    """Their courses, (n, M) each."""
 
     def raw(self, error: FloatArray) -> ComplexArray:
         """Return the spectrum of an error of the whole experiment (n, M) at the lines, (L, M)."""
@@ -67,6 +71,17 @@ class Lines:
     def projected(self, values: FloatArray) -> FloatArray:
         """Take out of (2 L M, ...) what is not known beforehand."""
         return values - self.free @ (self.free.T @ values)
+
+    def less_unknown(self, error: FloatArray) -> FloatArray:
+        """Return the rows of this span of an error (n, M), without what is not known beforehand."""
+        rows = slice(self.span.start, self.span.stop)
+        left = error[rows].copy()
+        if self.unknown:
+            columns = np.column_stack([self.weighted(c) for c in self.unknown])
+            solved = np.linalg.lstsq(columns, self.weighted(error), rcond=1e-8)[0]
+            for size, course in zip(solved, self.unknown, strict=True):
+                left -= size * course[rows]
+        return left
 
     def in_time(self, values: FloatArray) -> FloatArray:
         """Return weighted lines (2 L M,) as courses in time, (N, M), with the same sum of squares."""
@@ -123,7 +138,9 @@ def lines_of(
     stiff = np.abs(dynamic_stiffness(structure, 2 * np.pi * frequency)) ** 2
     moved = stiff @ white**2 * share / n
     if span.periods > 1:
-        noise = np.maximum(_between_harmonics(lines, span.periods), _repeated(lines, moved, span.periods))
+        noise = _between_harmonics(lines, span.periods)
+        most = MOST_REPEATED * np.median(noise, axis=0)
+        noise = np.maximum(noise, np.minimum(_repeated(lines, moved, span.periods), most))
     else:
         noise = _level(lines)
     torque = np.abs(shape.raw(motion.torque)) ** 2
@@ -136,7 +153,7 @@ def lines_of(
     stacked = np.zeros((2 * weight.size, 0))
     if unknown:
         stacked = np.column_stack([flat(shape.raw(c) * weight) for c in unknown])
-    return Lines(span, motion, window, weight, noise, _orthonormal(stacked))
+    return Lines(span, motion, window, weight, noise, _orthonormal(stacked), tuple(unknown))
 
 
 def _less(shape: Lines, error: FloatArray, unknown: Sequence[FloatArray]) -> ComplexArray:

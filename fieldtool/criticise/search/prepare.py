@@ -39,19 +39,32 @@ class Prepared:
             hypothesis.machine.with_values(hypothesis.base),
             motions,
             tuple(
-                band_limited(self.explained(errors[m.experiment], m), m.step, self.spans.top)
+                band_limited(self.cleaned(errors[m.experiment], m), m.step, self.spans.top)
                 for m in motions
             ),
             self.spans.top,
             self.spans.excited,
             frozenset(hypothesis.machine.names),
+            tuple(
+                {
+                    (s.periods / length, 1 / length)
+                    for s in self.spans.spans
+                    if s.periods > 1
+                    for length in [(s.stop - s.start) * motions[0].step]
+                }
+            ),
         )
 
-    def explained(self, error: FloatArray, motion: Motion) -> FloatArray:
-        """Count an error only where it is known, less its mean."""
-        counted = motion.counted
-        mean = np.sum(error * counted, axis=0) / np.maximum(counted.sum(axis=0), 1.0)
-        return np.asarray((error - mean) * counted)
+    def cleaned(self, error: FloatArray, motion: Motion) -> FloatArray:
+        """Count an error only where it is known and compared, less its mean and free motions."""
+        out = np.zeros_like(error)
+        for lines in self.simulator.lines:
+            if lines.span.experiment == motion.experiment:
+                out[lines.span.start : lines.span.stop] = lines.less_unknown(error)
+        compared = np.any(out != 0.0, axis=1)[:, None]
+        counted = motion.counted * compared
+        mean = np.sum(out * counted, axis=0) / np.maximum(counted.sum(axis=0), 1.0)
+        return np.asarray((out - mean) * counted)
 
 
 def prepare(recording: Recording, model: MachineModel, contiguous: bool = False) -> Prepared:

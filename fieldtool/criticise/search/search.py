@@ -208,7 +208,7 @@ def explained_torque(before: Parts, after: Parts, axis: int) -> float:
         for values, sign in ((first, 1.0), (second, -1.0)):
             both = values.reshape(2, *rows)[:, :, axis] / weight * (lines.weight[:, axis] > 0)
             gained += sign * float(np.sum(both**2))
-        torque = lines.raw(lines.motion.torque)[1:, axis]
+        torque = lines.raw(lines.motion.torque)[:, axis]
         whole += float(np.sum(np.abs(torque) ** 2))
     return float(np.sqrt(max(gained, 0.0) / max(whole, 1e-300)))
 

@@ -1,0 +1,308 @@
+"""Criticise a model with a recording: simulate, show where it is wrong, name causes, measure the gain."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fieldtool.criticise.changes import change_sentences
+from fieldtool.criticise.criticism import (
+    Cause,
+    Criticism,
+    HeldOut,
+    Number,
+    Rejected,
+    Rival,
+    SignalError,
+    Verdict,
+)
+from fieldtool.criticise.effects.base import Context, Effect
+from fieldtool.criticise.evidence.position import position_error
+from fieldtool.criticise.extension import extended_model
+from fieldtool.criticise.search.fit import Fitted
+from fieldtool.criticise.search.prepare import prepare
+from fieldtool.criticise.search.search import Accepted, Advance, Found, Parts, search
+from fieldtool.criticise.simulate.structure import Structure
+from fieldtool.criticise.tell_apart import experiment_for
+from fieldtool.criticise.where.sentences import (
+    AxisError,
+    axis_errors,
+    relative_error,
+    relative_noise,
+)
+from fieldtool.records.model import MachineModel
+from fieldtool.records.recording import Recording
+
+FloatArray = NDArray[np.float64]
+SMALL = 0.01
+"""Error of the torque beyond its noise that does not matter."""
+NEAR_NOISE = 1.5
+"""Error over noise (RMS) up to which it is all noise."""
+ENOUGH = 0.9
+"""Share of the explainable error that has to be explained for "explained"."""
+FLAT = 0.02
+"""Share of rows at one largest torque from which it is said that the drive was at its limit."""
+
+
+@dataclass(frozen=True, eq=False)
+class Criticised:
+    """A criticism, and what pictures are drawn from."""
+
+    criticism: Criticism
+    found: Found
+    before: tuple[AxisError, ...]
+    after: tuple[AxisError, ...]
+
+
+def criticise(
+    recording: Recording,
+    model: MachineModel,
+    prior: MachineModel | None = None,
+    without: frozenset[str] = frozenset(),
+    advance: Advance = lambda *_: None,
+    contiguous: bool = False,
+) -> Criticised:
+    """Say what a model gets wrong of a recording, and why.
+
+    Parameters
+    ----------
+    recording : Recording
+        Own or imported; in open or closed loop.
+    model : MachineModel
+        The identified machine: its masses, springs, dampers and couplings are where the fit starts.
+        Effects in it are tried anew, so that each name has its evidence.
+    prior : MachineModel, optional
+        The machine as last accepted.  What it has of friction and couplings belongs to the
+        machine; what the model has beyond has to be found as a cause.
+    without : frozenset of str
+        Effects that are not tried.
+    advance : callable
+        Told what is done, and how much of all: a number from 0 to 1.
+    contiguous : bool
+        Where the recording has to be cut in time, keep its last third unseen in one piece.
+
+    Raises
+    ------
+    NotEnoughDataError
+        If nothing can be compared, or the model is of other axes.
+    """
+    prepared = prepare(recording, _bare(model, prior), contiguous)
+    found = search(prepared, without, advance)
+    prepared = found.prepared
+    before = _axis_errors(found, found.before)
+    after = _axis_errors(found, found.after)
+    causes = tuple(_cause(found, a, recording) for a in found.accepted)
+    held = _held_out(found)
+    verdict = _verdict(causes, held)
+    return Criticised(
+        Criticism(
+            verdict=verdict,
+            where=tuple(e.sentence for e in before),
+            causes=causes,
+            unexplained=tuple(
+                e.sentence
+                for e in after
+                if verdict != "adequate" and _matters(e.error, e.noise)
+            ),
+            held_out=held,
+            rejected=tuple(
+                Rejected(e.name, _axis(recording.names, e), e.location, why)
+                for e, why in found.rejected
+                if why
+            ),
+            changes=() if prior is None else change_sentences(prior, model),
+            model=extended_model(found, recording.names),
+            band=(0.0, prepared.spans.top),
+            notes=_notes(recording, found),
+        ),
+        found,
+        before,
+        after,
+    )
+
+
+def _bare(model: MachineModel, prior: MachineModel | None) -> MachineModel:
+    """Return the model without what has to be found as a cause."""
+    if prior is None or prior.names != model.names:
+        return replace(model, effects=())
+    axes = []
+    for axis, accepted in zip(model.axes, prior.axes, strict=True):
+        known = {
+            name: getattr(axis, name) if getattr(accepted, name).value != 0.0 else getattr(accepted, name)
+            for name in ("viscous_friction", "load_friction")
+        }
+        axes.append(replace(axis, **known))
+    held = {frozenset(c.axes) for c in prior.couplings if c.value != 0.0}
+    couplings = tuple(c for c in model.couplings if frozenset(c.axes) in held)
+    return replace(model, axes=tuple(axes), couplings=couplings, effects=())
+
+
+def _all_parts(found: Found, fitted: Fitted) -> Parts:
+    simulator = found.prepared.simulator
+    return [
+        *simulator.parts(fitted.hypothesis, "fit"),
+        *simulator.parts(fitted.hypothesis, "unseen"),
+    ]
+
+
+def _axis_errors(found: Found, fitted: Fitted) -> tuple[AxisError, ...]:
+    context = found.prepared.context(fitted.hypothesis)
+    return axis_errors(context, _all_parts(found, fitted))
+
+
+def _matters(error: float, noise: float | None) -> bool:
+    """Whether an error is beyond noise, and large enough to be worth a word."""
+    if noise is None:
+        return error > SMALL
+    return error > NEAR_NOISE * noise and error**2 - noise**2 > SMALL**2
+
+
+def _axis(names: Sequence[str], effect: Effect) -> str | tuple[str, str]:
+    if effect.other is None:
+        return names[effect.axis]
+    return names[effect.axis], names[effect.other]
+
+
+def _cause(found: Found, accepted: Accepted, recording: Recording) -> Cause:
+    tried = accepted.tried
+    effect = tried.effect
+    names = recording.names
+    return Cause(
+        effect.name,
+        _axis(names, effect),
+        effect.location,
+        numbers_of(found.after, effect),
+        _evidence(tried.torque, tried.gain.p, tried.gain.blocks, effect),
+        tried.torque,
+        tried.gain.p,
+        tuple(
+            Rival(
+                t.effect.name,
+                _axis(names, t.effect),
+                t.effect.location,
+                experiment_for(effect.name, t.effect.name),
+            )
+            for t in accepted.ties
+        ),
+    )
+
+
+def _evidence(torque: float, p: float, blocks: int, effect: Effect) -> str:
+    chance = "below 1e-12" if p < 1e-12 else f"{p:.1g}"  # noqa: PLR2004
+    return (
+        f"on unseen data it explains {100 * torque:.2g} % of the torque (RMS) beside all other causes; "
+        f"probability by chance {chance} over {blocks} stretches; signature: {effect.signature}"
+    )
+
+
+def numbers_of(fitted: Fitted, effect: Effect) -> Mapping[str, Number]:
+    """Return the numbers of a cause with standard errors, by first-order propagation."""
+    keys = [e.key for e in fitted.hypothesis.effects]
+    place = len(keys) - 1 - keys[::-1].index(effect.key)
+    effect = fitted.hypothesis.effects[place]
+    values = dict(fitted.hypothesis.values[place])
+    lead = f"{place}:{effect.name}."
+    index = {n.removeprefix(lead): k for k, n in enumerate(fitted.names) if n.startswith(lead)}
+    out = {}
+    for name, (value, unit, depends) in effect.plain(values).items():
+        free = [d for d in depends if d in index]
+        if not free:
+            out[name] = Number(float(value), float("nan"), unit)
+            continue
+        gradient = []
+        for d in free:
+            step = 1e-4 * max(abs(values[d]), 1e-12)
+            moved = effect.plain({**values, d: values[d] + step})[name][0]
+            gradient.append((moved - value) / step)
+        rows = [index[d] for d in free]
+        g = np.array(gradient)
+        variance = float(g @ fitted.covariance[np.ix_(rows, rows)] @ g)
+        out[name] = Number(float(value), float(np.sqrt(max(variance, 0.0))), unit)
+    return out
+
+
+def _held_out(found: Found) -> HeldOut:
+    prepared = found.prepared
+    names = prepared.recording.names
+    errors, relative = [], []
+    for fitted in (found.before, found.after):
+        parts = prepared.simulator.parts(fitted.hypothesis, "unseen")
+        structure = Structure.of(fitted.hypothesis.machine.with_values(fitted.hypothesis.base))
+        positions = position_error(structure, prepared.recording.axes, parts)
+        torques = [relative_error(parts, k) for k in range(len(names))]
+        relative.append(torques)
+        errors.append(
+            {n: SignalError(t, p) for n, t, p in zip(names, torques, positions, strict=True)}
+        )
+    parts = prepared.simulator.parts(found.after.hypothesis, "unseen")
+    noise = [relative_noise(parts, k) for k in range(len(names))]
+    explained = {}
+    for k, name in enumerate(names):
+        floor = (noise[k] or 0.0) ** 2
+        could = max(relative[0][k] ** 2 - floor, 0.0)
+        done = relative[0][k] ** 2 - max(relative[1][k] ** 2, floor)
+        explained[name] = float(np.clip(done / could, 0.0, 1.0)) if could > 0 else 0.0
+    return HeldOut(
+        prepared.spans.unseen(),
+        prepared.spans.split,
+        errors[0],
+        errors[1],
+        dict(zip(names, noise, strict=True)),
+        explained,
+    )
+
+
+def _verdict(causes: Sequence[Cause], held: HeldOut) -> Verdict:
+    names = list(held.error_before)
+    left = {n for n in names if _matters(held.error_after[n].torque, held.noise_floor[n])}
+    if not causes:
+        return "unexplained" if left else "adequate"
+    if all(held.explained[n] >= ENOUGH for n in left):
+        return "explained"
+    return "partly explained"
+
+
+def _notes(recording: Recording, found: Found) -> tuple[str, ...]:
+    spans = found.prepared.spans
+    notes = []
+    if spans.split == "time":
+        seconds = sum(s.stop - s.start for s in spans.spans if s.role == "unseen")
+        notes.append(
+            "There are no experiments of a kind twice, so the data are cut in time: "
+            f"{seconds * recording.sample_period:.3g} s in "
+            f"{sum(s.role == 'unseen' for s in spans.spans)} stretches are kept unseen."
+        )
+    if any(s.periods < 2 for s in spans.spans):  # noqa: PLR2004
+        notes.append(
+            "The excitation does not repeat, so the noise is not known: what is not explained may in "
+            "part be noise."
+        )
+    for k, axis in enumerate(recording.axes):
+        if axis.controller is None:
+            notes.append(
+                f"{axis.name}: the recording states no controller; the error of its position is that in "
+                "open loop, at excited frequencies."
+            )
+        share = _flat_share(found, k)
+        if share > FLAT:
+            notes.append(
+                f"{axis.name}: its torque is at the same largest value in {100 * share:.0f} % of the rows: "
+                "the drive was at its limit there."
+            )
+    return tuple(notes)
+
+
+def _flat_share(found: Found, axis: int) -> float:
+    flat = rows = 0
+    for m in found.prepared.motions.values():
+        torque = m.torque[:, axis]
+        at = np.abs(torque) >= 0.999 * np.abs(torque).max()
+        flat += int(np.sum(at[1:] & at[:-1]))
+        rows += torque.size
+    return flat / max(rows, 1)
+
+
+def context_of(criticised: Criticised) -> Context:
+    """Return what pictures of the error before are drawn from."""
+    return criticised.found.prepared.context(criticised.found.before.hypothesis)

@@ -1,0 +1,1 @@
+"""Where a simulation is wrong: by frequency, amplitude, lines, speed, position, time, axis and pair."""
