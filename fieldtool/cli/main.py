@@ -33,6 +33,7 @@ from drives.profile import MachineProfile
 from fieldtool import workflow
 from fieldtool.cli.bus_options import Bitrate, Channel, Interface, on_bus
 from fieldtool.cli.check import check
+from fieldtool.cli.criticise import criticise
 from fieldtool.cli.output import console_of, print_json
 from fieldtool.cli.profile import profile_app
 from fieldtool.cli.replay import replay_command
@@ -498,6 +499,7 @@ app.command()(scan)
 app.add_typer(profile_app, name="profile")
 app.command()(check)
 app.command("replay")(replay_command)
+app.command()(criticise)
 
 
 def _lengths(masses: Sequence[str]) -> dict[str, int]:

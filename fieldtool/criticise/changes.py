@@ -87,8 +87,8 @@ def change_sentences(before: MachineModel, now: MachineModel) -> tuple[str, ...]
         factor = _together(firm, count)
         if factor is not None:
             sentence += (
-                f"; all its masses and springs changed by the same factor of {factor:.4g}: as of a wrong "
-                "scale of the torque. The motor's data sheet (motor_inertia) tells both apart"
+                f"; all its masses and springs changed by the same factor of {factor:.4g}: as of a "
+                "wrong scale of the torque. The motor's data sheet (motor_inertia) tells both apart"
             )
         elif len(firm) < count:
             rest = [
@@ -111,7 +111,7 @@ def change_sentences(before: MachineModel, now: MachineModel) -> tuple[str, ...]
 
 def _together(found: Sequence[Change], count: int) -> float | None:
     """Return the factor by which all masses and springs of an axis changed; None if not one."""
-    if len(found) < count or count < 2:  # noqa: PLR2004
+    if len(found) < count or count < 2:
         return None
     factors = [c.factor for c in found]
     middle = sum(factors) / len(factors)

@@ -1,6 +1,6 @@
-"""Criticise a model with a recording: simulate, show where it is wrong, name causes, measure the gain."""
+"""Criticise a model with a recording: where it is wrong, why, and what is gained by knowing."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,7 +11,6 @@ from fieldtool.criticise.criticism import (
     Cause,
     Criticism,
     HeldOut,
-    Number,
     Rejected,
     Rival,
     SignalError,
@@ -20,9 +19,12 @@ from fieldtool.criticise.criticism import (
 from fieldtool.criticise.effects.base import Context, Effect
 from fieldtool.criticise.evidence.position import position_error
 from fieldtool.criticise.extension import extended_model
+from fieldtool.criticise.numbers import numbers_of
+from fieldtool.criticise.search.afterwards import Accepted
 from fieldtool.criticise.search.fit import Fitted
+from fieldtool.criticise.search.judge import Parts
 from fieldtool.criticise.search.prepare import prepare
-from fieldtool.criticise.search.search import Accepted, Advance, Found, Parts, search
+from fieldtool.criticise.search.search import Advance, Found, search
 from fieldtool.criticise.simulate.structure import Structure
 from fieldtool.criticise.tell_apart import experiment_for
 from fieldtool.criticise.where.sentences import (
@@ -101,9 +103,7 @@ def criticise(
             where=tuple(e.sentence for e in before),
             causes=causes,
             unexplained=tuple(
-                e.sentence
-                for e in after
-                if verdict != "adequate" and _matters(e.error, e.noise)
+                e.sentence for e in after if verdict != "adequate" and _matters(e.error, e.noise)
             ),
             held_out=held,
             rejected=tuple(
@@ -129,7 +129,7 @@ def _bare(model: MachineModel, prior: MachineModel | None) -> MachineModel:
     axes = []
     for axis, accepted in zip(model.axes, prior.axes, strict=True):
         known = {
-            name: getattr(axis, name) if getattr(accepted, name).value != 0.0 else getattr(accepted, name)
+            name: getattr(axis if getattr(accepted, name).value != 0.0 else accepted, name)
             for name in ("viscous_friction", "load_friction")
         }
         axes.append(replace(axis, **known))
@@ -172,7 +172,7 @@ def _cause(found: Found, accepted: Accepted, recording: Recording) -> Cause:
         effect.name,
         _axis(names, effect),
         effect.location,
-        numbers_of(found.after, effect),
+        numbers_of(found.final, effect),
         _evidence(tried.torque, tried.gain.p, tried.gain.blocks, effect),
         tried.torque,
         tried.gain.p,
@@ -189,37 +189,11 @@ def _cause(found: Found, accepted: Accepted, recording: Recording) -> Cause:
 
 
 def _evidence(torque: float, p: float, blocks: int, effect: Effect) -> str:
-    chance = "below 1e-12" if p < 1e-12 else f"{p:.1g}"  # noqa: PLR2004
+    chance = "below 1e-12" if p < 1e-12 else f"{p:.1g}"
     return (
         f"on unseen data it explains {100 * torque:.2g} % of the torque (RMS) beside all other causes; "
         f"probability by chance {chance} over {blocks} stretches; signature: {effect.signature}"
     )
-
-
-def numbers_of(fitted: Fitted, effect: Effect) -> Mapping[str, Number]:
-    """Return the numbers of a cause with standard errors, by first-order propagation."""
-    keys = [e.key for e in fitted.hypothesis.effects]
-    place = len(keys) - 1 - keys[::-1].index(effect.key)
-    effect = fitted.hypothesis.effects[place]
-    values = dict(fitted.hypothesis.values[place])
-    lead = f"{place}:{effect.name}."
-    index = {n.removeprefix(lead): k for k, n in enumerate(fitted.names) if n.startswith(lead)}
-    out = {}
-    for name, (value, unit, depends) in effect.plain(values).items():
-        free = [d for d in depends if d in index]
-        if not free:
-            out[name] = Number(float(value), float("nan"), unit)
-            continue
-        gradient = []
-        for d in free:
-            step = 1e-4 * max(abs(values[d]), 1e-12)
-            moved = effect.plain({**values, d: values[d] + step})[name][0]
-            gradient.append((moved - value) / step)
-        rows = [index[d] for d in free]
-        g = np.array(gradient)
-        variance = float(g @ fitted.covariance[np.ix_(rows, rows)] @ g)
-        out[name] = Number(float(value), float(np.sqrt(max(variance, 0.0))), unit)
-    return out
 
 
 def _held_out(found: Found) -> HeldOut:
@@ -273,7 +247,7 @@ def _notes(recording: Recording, found: Found) -> tuple[str, ...]:
             f"{seconds * recording.sample_period:.3g} s in "
             f"{sum(s.role == 'unseen' for s in spans.spans)} stretches are kept unseen."
         )
-    if any(s.periods < 2 for s in spans.spans):  # noqa: PLR2004
+    if any(s.periods < 2 for s in spans.spans):
         notes.append(
             "The excitation does not repeat, so the noise is not known: what is not explained may in "
             "part be noise."
@@ -287,8 +261,8 @@ def _notes(recording: Recording, found: Found) -> tuple[str, ...]:
         share = _flat_share(found, k)
         if share > FLAT:
             notes.append(
-                f"{axis.name}: its torque is at the same largest value in {100 * share:.0f} % of the rows: "
-                "the drive was at its limit there."
+                f"{axis.name}: its torque is at the same largest value in {100 * share:.0f} % of the "
+                "rows: the drive was at its limit there."
             )
     return tuple(notes)
 

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from fieldtool.criticise.numbers import numbers_of
 from fieldtool.criticise.search.search import Found
 from fieldtool.records.model import Coupling, Estimate, MachineModel
 
@@ -22,9 +23,7 @@ def extended_model(found: Found, names: Sequence[str]) -> MachineModel:
     names : sequence of str
         Of the axes.
     """
-    from fieldtool.criticise.criticise import numbers_of
-
-    after = found.after
+    after = found.final
     hypothesis = after.hypothesis
     std = np.full(hypothesis.base.size, np.nan)
     for k, name in enumerate(hypothesis.machine.names):
@@ -58,7 +57,9 @@ def extended_model(found: Found, names: Sequence[str]) -> MachineModel:
 
 
 def _with_viscous(model: MachineModel, axis: int, location: str, number: Any) -> MachineModel:
-    name = "viscous_friction" if location == "motor" else "load_friction"
-    axes = list(model.axes)
-    axes[axis] = replace(axes[axis], **{name: Estimate(number.value, number.std)})
+    axes, estimate = list(model.axes), Estimate(number.value, number.std)
+    if location == "motor":
+        axes[axis] = replace(axes[axis], viscous_friction=estimate)
+    else:
+        axes[axis] = replace(axes[axis], load_friction=estimate)
     return replace(model, axes=tuple(axes))

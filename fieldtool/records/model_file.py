@@ -57,6 +57,7 @@ class _Coupling(_Estimate):
 class _Effect(StrictModel):
     effect: EffectName
     axis: str | tuple[str, ...] | None = None
+    location: str | None = None
     parameters: dict[str, _Parameter | Number]
 
 

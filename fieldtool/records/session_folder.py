@@ -62,6 +62,16 @@ class SessionFolder:
         return self.path / "model.yaml"
 
     @property
+    def criticism(self) -> Path:
+        """What the simulation of the model gets wrong, and why."""
+        return self.path / "criticism.yaml"
+
+    @property
+    def criticism_picture(self) -> Path:
+        """The errors before and after."""
+        return self.path / "criticism.png"
+
+    @property
     def tuning(self) -> Path:
         """Designed parameters."""
         return self.path / "tuning.yaml"

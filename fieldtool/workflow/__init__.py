@@ -5,6 +5,7 @@ simulation may stand behind the bus.
 """
 
 from fieldtool.workflow.checking import CheckResult, check
+from fieldtool.workflow.criticising import criticise_source as criticise
 from fieldtool.workflow.fast_measuring import plan
 from fieldtool.workflow.models import prior_model, truth_model
 from fieldtool.workflow.next_plan import next_plan
@@ -26,6 +27,7 @@ __all__ = [
     "SessionResult",
     "check",
     "compare",
+    "criticise",
     "draw",
     "export_folder",
     "identify",

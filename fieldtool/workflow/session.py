@@ -14,6 +14,7 @@ from drives.canopen_drive import CanopenGroup, connect
 from drives.parameters import Change, Written
 from drives.profile import MachineProfile, load_machine
 from drives.trace import trace_problem
+from fieldtool.criticise.criticism import Criticism
 from fieldtool.design.tuning import Tuning
 from fieldtool.errors import OutputError
 from fieldtool.experiment.forecast import AxisForecast
@@ -122,11 +123,14 @@ class SessionResult:
     wall_time: float
     """Seconds."""
     warnings: tuple[str, ...]
+    criticism: Criticism | None = None
+    """What the simulation gets wrong; None where the data did not allow a criticism."""
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values, as ``--json`` prints them."""
         return {
             "model": self.model.as_dict(),
+            "criticism": self.criticism.as_dict() if self.criticism else None,
             "truth": self.truth.as_dict() if self.truth else None,
             "time": {"machine_s": self.machine_time, "wall_s": self.wall_time},
             "parameters": parameter_table(self.write_back),

@@ -29,6 +29,7 @@ from fieldtool.records.recording import (
 from fieldtool.records.session_folder import SessionFolder
 from fieldtool.records.yaml_file import write_yaml
 from fieldtool.report.pictures import draw_responses
+from fieldtool.workflow.criticising import criticised
 from fieldtool.workflow.fast_measuring import measured_fast
 from fieldtool.workflow.measuring import measured
 from fieldtool.workflow.models import data_sheet_masses, prior_model, truth_model
@@ -60,7 +61,7 @@ def run(
     confirm: Confirm = lambda _: False,
     stop_requested: Callable[[], bool] = never,
 ) -> SessionResult:
-    """Measure, identify, design and, if wanted, write back.
+    """Measure, identify, criticise, design and, if wanted, write back.
 
     Parameters
     ----------
@@ -91,8 +92,9 @@ def run(
         machine_time = _measured(session, group, options)
         identified = _identify(session, options)
         session.screen.found(identified.model, truth_model(session.machine))
+        model, criticism = criticised(session, identified.model, stop_requested)
         session.screen.stage("Design new controller parameters")
-        tuning = _design(session.folder, session.machine, identified.model)
+        tuning = _design(session.folder, session.machine, model)
         session.screen.designed(tuning)
         if stop_requested():
             raise UserStopError(
@@ -109,6 +111,7 @@ def run(
         machine_time,
         time.perf_counter() - begin,
         tuple(session.warnings),
+        criticism,
     )
 
 

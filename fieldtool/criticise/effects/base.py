@@ -52,7 +52,7 @@ class Effect:
     contrary: ClassVar[str]
     """What it must not leave."""
     shows: ClassVar[tuple[str, ...]] = ()
-    """Views of the error (:mod:`fieldtool.criticise.where.views`) of which one at least has to show it."""
+    """Views of the error (:mod:`fieldtool.criticise.where.views`): one at least has to show it."""
 
     axis: int
     parameters: tuple[Parameter, ...]
@@ -112,7 +112,7 @@ class Context:
     variable: frozenset[str]
     """Names of the model's numbers that are fitted beside."""
     fundamentals: tuple[tuple[float, float], ...] = ()
-    """Of periodic excitation: its lowest frequency, and the distance of lines that can be told apart, Hz."""
+    """Of periodic excitation: its lowest frequency, and the distance of separate lines, Hz."""
 
     def fastest(self, axis: int) -> float:
         """Speed that 1 % of the rows exceed, rad/s or m/s."""

@@ -130,7 +130,9 @@ def friction_candidates(context: Context) -> list[Effect]:
         def dry(name: str, size: float = size, unit: str = torque) -> Parameter:
             return Parameter(name, unit, 0.0, 0.0, 10.0 * size, 0.1 * size, linear=True)
 
-        def viscous(name: str, fast: float = fastest, size: float = size, unit: str = wet) -> Parameter:
+        def viscous(
+            name: str, fast: float = fastest, size: float = size, unit: str = wet
+        ) -> Parameter:
             most = 10.0 * size / fast
             return Parameter(name, unit, 0.0, -most, most, 0.1 * size / fast, linear=True)
 
@@ -170,13 +172,19 @@ def friction_candidates(context: Context) -> list[Effect]:
                     (
                         dry("torque"),
                         dry("extra"),
-                        Parameter("velocity", _speed_unit(context, axis), slow * fastest,
-                                  0.005 * fastest, 0.7 * fastest, 0.3 * slow * fastest),
+                        Parameter(
+                            "velocity",
+                            _speed_unit(context, axis),
+                            slow * fastest,
+                            0.005 * fastest,
+                            0.7 * fastest,
+                            0.3 * slow * fastest,
+                        ),
                         reach,
                         turn,
                     ),
                     replaces=("coulomb_friction",),
-                )  # fmt: skip
+                )
                 for slow in SLOWEST
             )
         if context.masses(axis) > 1:
@@ -197,7 +205,7 @@ def _signed_slider(
 ) -> FloatArray:
     """Return the slider's force, linear in its limits: a negative mean limit turns it round."""
     sign = 1.0 if float(np.mean(forward + backward)) >= 0 else -1.0
-    return sign * slider(position, sign * forward, sign * backward, reach)
+    return np.asarray(sign * slider(position, sign * forward, sign * backward, reach))
 
 
 def _rounded(motion: Motion, axis: int, values: Values) -> FloatArray:

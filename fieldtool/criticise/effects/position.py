@@ -104,7 +104,11 @@ def position_candidates(context: Context) -> list[Effect]:
     """Return gravity, and waves at the orders at which the error has them."""
     out: list[Effect] = []
     for axis, info in enumerate(context.axes):
-        unit, size, travel = context.torque_unit(axis), context.torque_size(axis), context.travel(axis)
+        unit, size, travel = (
+            context.torque_unit(axis),
+            context.torque_size(axis),
+            context.travel(axis),
+        )
         if travel <= 0.0:
             continue
 
@@ -115,7 +119,10 @@ def position_candidates(context: Context) -> list[Effect]:
             most = 30.0 * size
             out.append(Gravity(axis, (wave("sine", most, unit), wave("cosine", most, unit))))
         per = "rad/m" if info.kind == "linear" else "1/turn"
-        for kind, length, most in ((Cogging, unit, 5 * size), (EncoderError, info.position_unit, 0.02 * travel)):
+        for kind, length, most in (
+            (Cogging, unit, 5 * size),
+            (EncoderError, info.position_unit, 0.02 * travel),
+        ):
             for order in waves(context, axis, kind is EncoderError):
                 low, high = 0.9 * order, 1.1 * order
                 number = Parameter("order", per, order, low, high, 0.1 * 2 * np.pi / travel)
@@ -128,7 +135,8 @@ def waves(context: Context, axis: int, accelerated: bool) -> list[float]:
     """Orders, 1/rad or 1/m, at which a wave over the position explains most of the error."""
     travel, fastest = context.travel(axis), context.fastest(axis)
     lowest = 2 * np.pi * FEWEST_WAVES / travel
-    highest = min(2 * np.pi * context.top / max(0.1 * fastest, 1e-12), MOST_ORDERS / FINEST * 2 * np.pi / travel)
+    finest = MOST_ORDERS / FINEST * 2 * np.pi / travel
+    highest = min(2 * np.pi * context.top / max(0.1 * fastest, 1e-12), finest)
     if context.axes[axis].kind == "rotary":
         lowest = max(lowest, 1.5) if not accelerated else max(lowest, 0.9)
     if highest <= lowest:
@@ -159,4 +167,3 @@ def waves(context: Context, axis: int, accelerated: bool) -> list[float]:
 
 def _length(per: str) -> str:
     return "rad" if per == "1/turn" else "m"
-

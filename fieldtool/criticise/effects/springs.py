@@ -127,9 +127,7 @@ class StructuralDamping(SpringEffect):
         # The branches stiffen the spring above the middle; taken off, k is that at the middle.
         stiffness = structure.stiffness.copy()
         stiffness[np.ix_([a, b], [a, b])] -= BRANCHES / 2 * each * np.array([[1, -1], [-1, 1]])
-        return replace(
-            structure, stiffness=stiffness, branches=(*structure.branches, *branches)
-        )
+        return replace(structure, stiffness=stiffness, branches=(*structure.branches, *branches))
 
     def plain(self, values: Values) -> dict[str, tuple[float, str, tuple[str, ...]]]:
         """Return the loss factor; the band is no property of the machine."""
@@ -151,7 +149,7 @@ class ExtraMode(Effect):
         w = 2 * np.pi * values["frequency"]
         m = values["mass"]
         damping = 2 * values["damping_ratio"] * m * w
-        safe = m if abs(m) > 1e-9 else 1e-9  # noqa: PLR2004
+        safe = m if abs(m) > 1e-9 else 1e-9
         return structure.with_mass(int(ends[self.axis]), safe, safe * w * w, damping)
 
 
@@ -166,7 +164,9 @@ def spring_candidates(context: Context) -> list[Effect]:
             size = context.elongations(axis, spring)
             most = 3.0 * k / size**2
             for kind, low, high in ((HardeningSpring, 0.0, most), (SofteningSpring, -most, 0.0)):
-                cubic = Parameter("cubic", f"{per}3", 0.0, low, high, 0.01 * k / size**2, linear=True)
+                cubic = Parameter(
+                    "cubic", f"{per}3", 0.0, low, high, 0.01 * k / size**2, linear=True
+                )
                 out.append(kind(axis, (cubic,), place))
             out += [
                 Backlash(
@@ -213,7 +213,9 @@ def mode_candidates(context: Context) -> list[Effect]:
                         axis,
                         (
                             Parameter("mass", unit, 0.0, 0.0, inertia, 0.01 * inertia, linear=True),
-                            Parameter("frequency", "Hz", f, 0.5 * low, 1.1 * context.excited, 0.02 * f),
+                            Parameter(
+                                "frequency", "Hz", f, 0.5 * low, 1.1 * context.excited, 0.02 * f
+                            ),
                             Parameter("damping_ratio", "1", 0.03, 0.0005, 0.5, 0.02),
                         ),
                         place,

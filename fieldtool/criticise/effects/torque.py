@@ -73,11 +73,14 @@ class MeasurementDelay(Effect):
     def motion(self, motion: Motion, values: Values) -> Motion:
         """Shift the motion of the axis to when it was, by Lagrange interpolation."""
         shift = values["delay"] / motion.step
-        columns = {
-            name: _shifted(getattr(motion, name), self.axis, shift)
-            for name in ("position", "velocity", "acceleration", "smooth_position", "smooth_velocity")
-        }
-        return replace(motion, **columns)
+        return replace(
+            motion,
+            position=_shifted(motion.position, self.axis, shift),
+            velocity=_shifted(motion.velocity, self.axis, shift),
+            acceleration=_shifted(motion.acceleration, self.axis, shift),
+            smooth_position=_shifted(motion.smooth_position, self.axis, shift),
+            smooth_velocity=_shifted(motion.smooth_velocity, self.axis, shift),
+        )
 
 
 class TorqueSaturation(Effect):
@@ -101,7 +104,9 @@ class PeriodicDisturbance(Effect):
     """A torque of one frequency in time, whatever the axis does."""
 
     name = "periodic_disturbance"
-    equation = "tau = amplitude sin(2 pi frequency t + phase), a phase of its own in each experiment"
+    equation = (
+        "tau = amplitude sin(2 pi frequency t + phase), a phase of its own in each experiment"
+    )
     source = "a neighbour's drive, a pump, the mains; Bodson, Adaptive Algorithms, 2005"
     signature = "one line of the spectrum at the same frequency in all experiments"
     contrary = "a frequency that goes with the speed or the period of the excitation"
@@ -128,9 +133,17 @@ def torque_candidates(context: Context) -> list[Effect]:
         out += [
             TorqueSaturation(
                 axis,
-                (Parameter("limit", context.torque_unit(axis), share * largest, 0.3 * largest,
-                           1.05 * largest, 0.02 * largest),),
-            )  # fmt: skip
+                (
+                    Parameter(
+                        "limit",
+                        context.torque_unit(axis),
+                        share * largest,
+                        0.3 * largest,
+                        1.05 * largest,
+                        0.02 * largest,
+                    ),
+                ),
+            )
             for share in CLIPPED
         ]
     return out
@@ -163,13 +176,15 @@ def disturbance_candidates(context: Context) -> list[Effect]:
         for k in np.argsort(level)[::-1][:2]:
             if level[k] > STANDS_OUT:
                 f = float(grid[inside][k])
-                number = Parameter("frequency", "Hz", f, f - 0.5 * width, f + 0.5 * width, 0.1 * width)
+                number = Parameter(
+                    "frequency", "Hz", f, f - 0.5 * width, f + 0.5 * width, 0.1 * width
+                )
                 out.append(PeriodicDisturbance(axis, (number,)))
     return out
 
 
 def _shifted(values: FloatArray, axis: int, shift: float) -> FloatArray:
-    """Return the columns with that of ``axis`` read so many rows later, by six-point Lagrange polynomials."""
+    """Return the columns, that of ``axis`` read so many rows later (six-point Lagrange)."""
     whole = int(np.floor(shift))
     part = shift - whole
     nodes = np.arange(-2, 4)

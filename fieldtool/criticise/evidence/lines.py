@@ -3,8 +3,8 @@
 An error e (n, M) in the rows of one span becomes E(f) / sqrt(S(f)) at the lines of the band, S its
 noise; what is not known beforehand of each span (the hidden masses' first position and velocity)
 is projected out.  Measured and modelled torque thus pass the same filter.
-S comes from the lines between the harmonics and from the top of the band where the excitation is periodic,
-and from a white level and the noise of the position where it is not.
+S comes from the lines between the harmonics and from the top of the band where the excitation is
+periodic, and from a white level and the noise of the position where it is not.
 """
 
 from collections.abc import Sequence
@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import butter, sosfiltfilt
 from scipy.signal.windows import tukey
 
 from fieldtool.criticise.evidence.spans import Span
@@ -21,6 +22,8 @@ from fieldtool.criticise.simulate.structure import Structure
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
+ORDER, CORNER = 4, 1.3
+"""Of the low-pass, its corner over the top of the band."""
 TAPER = 0.1
 """Share of a span in which both its ends fade, where it is not periodic."""
 SMALL = 1e-4
@@ -51,6 +54,8 @@ class Lines:
     """(n, M): taper times the rows that count."""
     weight: FloatArray
     """1 / sqrt(S), (L, M)."""
+    filter: FloatArray
+    """Sections of the low-pass that both torques pass, forward and backward."""
     noise: FloatArray
     """S, (L, M)."""
     free: FloatArray
@@ -59,8 +64,12 @@ class Lines:
     """Their courses, (n, M) each."""
 
     def raw(self, error: FloatArray) -> ComplexArray:
-        """Return the spectrum of an error of the whole experiment (n, M) at the lines, (L, M)."""
-        rows = error[self.span.start : self.span.stop]
+        """Return the spectrum of an error of the whole experiment (n, M) at the lines, (L, M).
+
+        What is above the band is taken out before rows are left out, or these would fold it into it.
+        """
+        filtered = sosfiltfilt(self.filter, error, axis=0)
+        rows = filtered[self.span.start : self.span.stop]
         spectrum = np.fft.rfft(rows * self.window, axis=0) / rows.shape[0]
         return np.asarray(spectrum[: self.weight.shape[0]])
 
@@ -130,7 +139,8 @@ def lines_of(
     window = taper[:, None] * motion.counted[span.start : span.stop]
     count = max(8, int(top * n * motion.step))
     ones = np.ones((count, M))
-    shape = Lines(span, motion, window, ones, ones, np.zeros((2 * count * M, 0)))
+    low_pass = butter(ORDER, min(CORNER * top * 2 * motion.step, 0.9), output="sos")
+    shape = Lines(span, motion, window, ones, low_pass, ones, np.zeros((2 * count * M, 0)))
     lines = _less(shape, error, unknown)
     frequency = np.arange(count) / (n * motion.step)
     white = white_noise(motion.position[span.start : span.stop])
@@ -153,7 +163,8 @@ def lines_of(
     stacked = np.zeros((2 * weight.size, 0))
     if unknown:
         stacked = np.column_stack([flat(shape.raw(c) * weight) for c in unknown])
-    return Lines(span, motion, window, weight, noise, _orthonormal(stacked), tuple(unknown))
+    free = _orthonormal(stacked)
+    return Lines(span, motion, window, weight, low_pass, noise, free, tuple(unknown))
 
 
 def _less(shape: Lines, error: FloatArray, unknown: Sequence[FloatArray]) -> ComplexArray:

@@ -1,7 +1,7 @@
 """What an error of the torque makes of the position.
 
-A torque d that the model does not know moves the motors by (Z + K)^-1 d, Z the dynamic stiffness of the machine
-and K the loops' torque per position where the recording states the controllers; without
+A torque d that the model does not know moves the motors by (Z + K)^-1 d, Z the dynamic stiffness of
+the machine and K the loops' torque per position where the recording states the controllers; without
 them the loop is open, and only lines with excitation are counted (below them a free axis drifts).
 """
 
@@ -48,7 +48,7 @@ def position_error(
     for lines, values in parts:
         count = lines.weight.shape[0]
         seconds = (lines.span.stop - lines.span.start) * lines.motion.step
-        omega = 2 * np.pi * np.arange(1, count) / seconds
+        omega: FloatArray = np.asarray(2 * np.pi / seconds * np.arange(1.0, count))
         torque = np.abs(lines.raw(lines.motion.torque)[1:])
         excited = np.any(torque > EXCITED * torque.max(axis=0), axis=1)
         if all(loop is not None for loop in loops):

@@ -110,7 +110,7 @@ def spans_of(
     step = recording.sample_period
     rows = [_rows(e, step) for e in experiments]
     excited, top = _band(experiments, rows, step)
-    roles = _roles(recording, experiments)
+    roles = _roles(experiments)
     if "unseen" in roles:
         spans = [
             Span(e.name, start, stop, role, periods)
@@ -161,7 +161,7 @@ def _band(
     return min(most, top), top
 
 
-def _roles(recording: Recording, experiments: Sequence[Experiment]) -> list[Role]:
+def _roles(experiments: Sequence[Experiment]) -> list[Role]:
     """Keep a third of each group of like experiments unseen, at least one of two."""
     roles: list[Role] = ["fit"] * len(experiments)
     groups: list[list[int]] = []
@@ -183,10 +183,8 @@ def _roles(recording: Recording, experiments: Sequence[Experiment]) -> list[Role
     return roles
 
 
-def _stretches(
-    name: str, start: int, stop: int, periods: int, contiguous: bool
-) -> list[Span]:
-    if periods >= 3:  # noqa: SIM108
+def _stretches(name: str, start: int, stop: int, periods: int, contiguous: bool) -> list[Span]:
+    if periods >= 3:
         edges = np.linspace(0, periods, min(STRETCHES, periods) + 1).round().astype(int)
         edges = start + edges * ((stop - start) // periods)
     else:
@@ -194,7 +192,7 @@ def _stretches(
     count = len(edges) - 1
     parts = []
     for k in range(count):
-        late = k >= count - count // 3 if contiguous else k % 3 == 2  # noqa: PLR2004
+        late = k >= count - count // 3 if contiguous else k % 3 == 2
         role: Role = "unseen" if late else "fit"
         whole = round((edges[k + 1] - edges[k]) / ((stop - start) / periods)) if periods else 0
         parts.append(Span(name, int(edges[k]), int(edges[k + 1]), role, whole))
@@ -207,6 +205,8 @@ def _joined(parts: list[Span]) -> list[Span]:
     for part in parts:
         if out and out[-1].role == part.role:
             last = out.pop()
-            part = Span(part.experiment, last.start, part.stop, part.role, last.periods + part.periods)  # noqa: PLW2901
-        out.append(part)
+            periods = last.periods + part.periods
+            out.append(Span(part.experiment, last.start, part.stop, part.role, periods))
+        else:
+            out.append(part)
     return out

@@ -119,17 +119,15 @@ def fit(
     steps : int
         Most steps.
     shared : ndarray
-        Derivatives with respect to the machine's numbers at a hypothesis nearby, (rows, all variables): taken
-        for the first steps, which saves most of the time.
+        Derivatives with respect to the machine's numbers at a hypothesis nearby, (rows, all
+        variables): taken for the first steps, which saves most of the time.
     """
     free = free_numbers(hypothesis)
     scales = np.array([f.scale for f in free])
     known = np.array([1.0 / f.known for f in free])
     current = hypothesis
     vector = vector_of(current, free)
-    origin = vector_of(
-        replace(hypothesis, base=hypothesis.machine.start), free
-    )
+    origin = vector_of(replace(hypothesis, base=hypothesis.machine.start), free)
     r = simulator.residual(current, "fit")
     cost = float(r @ r)
     damping, jacobian = 1e-6, np.zeros((r.size, len(free)))

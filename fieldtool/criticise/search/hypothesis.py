@@ -43,7 +43,9 @@ class Hypothesis:
             (e, v)
             for e, v in zip(self.effects, self.values, strict=True)
             if not (e.axis == effect.axis and e.name in effect.replaces)
-            and not (e.key == effect.key and e.name not in {"cogging", "encoder_error", "extra_mode"})
+            and not (
+                e.key == effect.key and e.name not in {"cogging", "encoder_error", "extra_mode"}
+            )
         ]
         start = {p.name: p.start for p in effect.parameters}
         grown = replace(

@@ -23,7 +23,8 @@ class Variable:
     """One number of the model: where it stands, and its size."""
 
     name: str
-    """``axis.mass1``, ``axis.spring1``, ``axis.damper1``, ``axis.viscous_friction``, ``a+b.coupling``."""
+    """``axis.mass1``, ``axis.spring1``, ``axis.damper1``, ``axis.viscous_friction``,
+    ``a+b.coupling``, ``axis.offset``."""
     value: float
     scale: float
     """Its own size, or of what would matter where it is zero."""
@@ -55,21 +56,29 @@ class Machine:
         for axis in model.axes:
             for kind, values in (("mass", axis.masses), ("spring", axis.springs)):
                 out += [
-                    Variable(f"{axis.name}.{kind}{k + 1}", e.value, abs(e.value), KNOWN, positive=True)
+                    Variable(
+                        f"{axis.name}.{kind}{k + 1}", e.value, abs(e.value), KNOWN, positive=True
+                    )
                     for k, e in enumerate(values)
                 ]
             for k, e in enumerate(axis.dampers or (Estimate(0.0),) * len(axis.springs)):
                 light = 2 * LIGHT * np.sqrt(axis.springs[k].value * axis.masses[k + 1].value)
                 size = max(abs(e.value), float(light))
-                out.append(Variable(f"{axis.name}.damper{k + 1}", e.value, size, KNOWN, positive=False))
+                out.append(
+                    Variable(f"{axis.name}.damper{k + 1}", e.value, size, KNOWN, positive=False)
+                )
             for name in ("viscous_friction", "load_friction"):
                 value = getattr(axis, name).value
                 if value != 0.0:
-                    out.append(Variable(f"{axis.name}.{name}", value, abs(value), KNOWN, positive=False))
+                    out.append(
+                        Variable(f"{axis.name}.{name}", value, abs(value), KNOWN, positive=False)
+                    )
         for c in model.couplings:
             ends = [model.axes[model.names.index(name)].masses[-1].value for name in c.axes]
             size = max(abs(c.value), 0.1 * float(np.sqrt(ends[0] * ends[1])))
-            out.append(Variable(f"{'+'.join(c.axes)}.coupling", c.value, size, KNOWN, positive=False))
+            out.append(
+                Variable(f"{'+'.join(c.axes)}.coupling", c.value, size, KNOWN, positive=False)
+            )
         for name, largest in zip(model.names, largest_torque, strict=True):
             size = max(float(largest), 1e-12)
             out.append(Variable(f"{name}.offset", 0.0, size, OFFSET, positive=False))
@@ -93,7 +102,7 @@ class Machine:
     def clipped(self, values: FloatArray) -> FloatArray:
         """Keep masses and springs above zero."""
         least = np.array([SMALLEST * v.value if v.positive else -np.inf for v in self.variables])
-        return np.maximum(values, least)
+        return np.asarray(np.maximum(values, least), dtype=np.float64)
 
     def with_values(self, values: FloatArray, std: FloatArray | None = None) -> MachineModel:
         """Return the model with other values, and standard errors where they are known."""
@@ -128,7 +137,7 @@ class Machine:
 
     def offsets(self, values: FloatArray) -> FloatArray:
         """Return the constant that each torque measurement is off, (M,)."""
-        return np.asarray(values[-len(self.model.axes) :])
+        return np.asarray(values[-len(self.model.axes) :], dtype=np.float64)
 
     def physical(self, values: FloatArray) -> bool:
         """Whether the mass matrix has positive energy."""

@@ -56,15 +56,12 @@ class Prepared:
         )
 
     def cleaned(self, error: FloatArray, motion: Motion) -> FloatArray:
-        """Count an error only where it is known and compared, less its mean and free motions."""
+        """Count an error only where it is known and compared, less free motions."""
         out = np.zeros_like(error)
         for lines in self.simulator.lines:
             if lines.span.experiment == motion.experiment:
                 out[lines.span.start : lines.span.stop] = lines.less_unknown(error)
-        compared = np.any(out != 0.0, axis=1)[:, None]
-        counted = motion.counted * compared
-        mean = np.sum(out * counted, axis=0) / np.maximum(counted.sum(axis=0), 1.0)
-        return np.asarray((out - mean) * counted)
+        return np.asarray(out * motion.counted)
 
 
 def prepare(recording: Recording, model: MachineModel, contiguous: bool = False) -> Prepared:
@@ -120,9 +117,7 @@ def reweighted(prepared: Prepared, hypothesis: Hypothesis) -> Prepared:
             )
         )
     simulator = Simulator(prepared.motions, tuple(lines))
-    return Prepared(
-        prepared.recording, prepared.spans, prepared.motions, simulator, prepared.start
-    )
+    return Prepared(prepared.recording, prepared.spans, prepared.motions, simulator, prepared.start)
 
 
 def _from(courses: list[FloatArray], start: int) -> list[FloatArray]:

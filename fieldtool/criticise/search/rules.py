@@ -116,7 +116,8 @@ def _unphysical(tried: Tried, context: Context) -> str:
         close = 1e-6 * max(abs(p.high - p.low), 1e-300)
         at_zero = p.low == 0.0 and values[p.name] <= close
         if values[p.name] >= p.high - close or (values[p.name] <= p.low + close and not at_zero):
-            return f"its {p.name} would be at the edge of what is physical ({values[p.name]:.3g} {p.unit})"
+            number = f"{values[p.name]:.3g} {p.unit}"
+            return f"its {p.name} would be at the edge of what is physical ({number})"
     strong = [n for n in STRENGTH[effect.name] if n in numbers]
     if strong:
         reference = 1.0 if effect.name == "torque_scale" else 0.0

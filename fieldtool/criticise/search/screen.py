@@ -1,4 +1,4 @@
-"""What each candidate could gain, by its linear part: cheap, so that only the best are fitted in full."""
+"""What each candidate could gain, by its linear part: cheap, so that only the best are fitted."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -49,7 +49,7 @@ def tangent(simulator: Simulator, hypothesis: Hypothesis) -> Tangent:
     size = np.linalg.norm(rows, axis=0)
     size[size == 0.0] = 1.0
     basis, triangle = np.linalg.qr(rows / size)
-    basis = basis[:, np.abs(np.diag(triangle)) > 1e-10]  # noqa: PLR2004
+    basis = basis[:, np.abs(np.diag(triangle)) > 1e-10]
     side = np.concatenate([r, np.zeros(int(on.sum()))])
     side = side - basis @ (basis.T @ side)
     return Tangent(hypothesis, r, jacobian, basis, side)
@@ -98,7 +98,9 @@ def _screen(simulator: Simulator, at: Tangent, effect: Effect) -> Screened | Non
         if effect.name == "torque_scale":
             p = effect.parameters[0]
             start[p.name] = p.start + 0.1 * p.scale
-            moved = Hypothesis(grown.machine, grown.base, grown.effects, (*grown.values[:-1], start))
+            moved = Hypothesis(
+                grown.machine, grown.base, grown.effects, (*grown.values[:-1], start)
+            )
             column = (simulator.residual(moved, "fit") - at.residual) / (0.1 * p.scale)
             lowest, highest = -0.5, 0.5
         columns, low, high = [column], [lowest], [highest]
@@ -123,7 +125,7 @@ def _solved(
     side = np.concatenate([r, np.zeros(more)])
     side -= at.basis @ (at.basis.T @ side)
     size = np.linalg.norm(rows, axis=0)
-    active = size > 1e-9 * max(float(np.linalg.norm(columns)), 1e-300)  # noqa: PLR2004
+    active = size > 1e-9 * max(float(np.linalg.norm(columns)), 1e-300)
     values = np.zeros(columns.shape[1])
     for _ in range(columns.shape[1]):
         if not active.any():

@@ -1,11 +1,11 @@
 """Whether one hypothesis is better than another on data that neither has seen, by more than chance.
 
-The weighted errors of the unseen spans are taken back into time and squared, block by block; each block gives
-one difference between both hypotheses.  Neighbouring blocks may be alike (errors of a model are not
-white), so the standard error of the mean difference counts their correlation: a t-test whose number
-of blocks is the effective one, n (1 - r) / (1 + r), r the correlation of neighbours.  Blocks differ in
-size, and a few large ones make such a test blind; so the differences over the sums of both are tested as
-well, and the smaller of both probabilities counts twice.
+The weighted errors of the unseen spans are taken back into time and squared, block by block; each
+block gives one difference between both hypotheses.  Neighbouring blocks may be alike (errors of a
+model are not white), so the standard error of the mean difference counts their correlation: a t-test
+whose number of blocks is the effective one, n (1 - r) / (1 + r), r the correlation of neighbours.
+Blocks differ in size, and a few large ones make such a test blind; so the differences over the sums of
+both are tested as well, and the smaller of both probabilities counts twice.
 """
 
 from collections.abc import Sequence
@@ -61,14 +61,16 @@ def compared(before: Parts, after: Parts) -> Comparison:
     t_relative, p_relative = chance(np.array(gains) / np.maximum(np.array(sizes), 1e-300))
     if sums[1] >= sums[0]:
         return Comparison(sums[0], sums[1], min(t, 0.0), 1.0, len(gains))
-    return Comparison(sums[0], sums[1], max(t, t_relative), min(1.0, 2 * min(p, p_relative)), len(gains))
+    return Comparison(
+        sums[0], sums[1], max(t, t_relative), min(1.0, 2 * min(p, p_relative)), len(gains)
+    )
 
 
 def chance(gains: FloatArray) -> tuple[float, float]:
     """Return t and one-sided p of a mean above zero, for values that may be correlated in order."""
     n = gains.size
     spread = float(np.std(gains, ddof=1)) if n > 1 else 0.0
-    if n < 3 or spread == 0.0:  # noqa: PLR2004
+    if n < 3 or spread == 0.0:
         return 0.0, 1.0
     centred = gains - gains.mean()
     r = float(np.sum(centred[1:] * centred[:-1]) / np.sum(centred**2))

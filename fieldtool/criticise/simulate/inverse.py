@@ -39,7 +39,7 @@ class HiddenSystem:
         """Cut the structure at its motors."""
         hidden, motors = structure.hidden, structure.motors
         H, M, W = hidden.size, motors.size, len(structure.branches)
-        M_, C, K = structure.mass, structure.damping, structure.stiffness
+        M_, C = structure.mass, structure.damping
         inverse = np.linalg.inv(M_[np.ix_(hidden, hidden)])
         size = 2 * H + W
         rates, inputs = np.zeros((size, size)), np.zeros((size, 3 * M))
@@ -150,7 +150,7 @@ def needed_torque(structure: Structure, motion: Motion) -> FloatArray:
 
 
 def dynamic_stiffness(structure: Structure, omega: FloatArray) -> NDArray[np.complex128]:
-    """Return torque of motor [row] per position of motor [column] at rad/s, (L, M, M); elements left out."""
+    """Return torque of motor [row] per position of motor [column], (L, M, M), without elements."""
     w = omega[:, None, None]
     whole = structure.stiffness + 1j * w * structure.damping - w**2 * structure.mass
     hidden, motors = structure.hidden, structure.motors

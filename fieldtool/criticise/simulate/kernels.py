@@ -17,7 +17,7 @@ CUBIC, GAP, STEP, DRY = 1, 2, 3, 4
 """As :class:`fieldtool.criticise.simulate.structure.Law`."""
 
 
-@njit(cache=True)
+@njit(cache=True)  # type: ignore[untyped-decorator]
 def march(step: FloatArray, forced: FloatArray, start: FloatArray) -> FloatArray:
     """Return z of z[k+1] = step z[k] + forced[k] from z[0] = start, (n, S)."""
     n, size = forced.shape
@@ -37,7 +37,7 @@ def march(step: FloatArray, forced: FloatArray, start: FloatArray) -> FloatArray
     return states
 
 
-@njit(cache=True)
+@njit(cache=True)  # type: ignore[untyped-decorator]
 def forces(
     laws: IntArray,
     ends: IntArray,
@@ -77,7 +77,7 @@ def forces(
             out[b] -= pull
 
 
-@njit(cache=True)
+@njit(cache=True)  # type: ignore[untyped-decorator]
 def march_bent(
     step: FloatArray,
     of_start: FloatArray,
@@ -149,7 +149,7 @@ def march_bent(
     return states, pushed
 
 
-@njit(cache=True)
+@njit(cache=True)  # type: ignore[untyped-decorator]
 def slider(
     position: FloatArray, forward: FloatArray, backward: FloatArray, reach: float
 ) -> FloatArray:

@@ -108,7 +108,7 @@ def _motion(experiment: Experiment, step: float, begin: float, top: float) -> Mo
     return Motion(
         experiment.name,
         step,
-        begin + step * np.arange(experiment.samples),
+        np.asarray(begin + step * np.arange(experiment.samples), dtype=np.float64),
         position,
         velocity,
         acceleration,

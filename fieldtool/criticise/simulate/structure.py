@@ -16,7 +16,7 @@ FloatArray = NDArray[np.float64]
 
 
 class Law(IntEnum):
-    """What an element does with its elongation s, its rate s' and the time t; force that pulls both ends together."""
+    """The force with which an element pulls its ends together: elongation s, rate s', time t."""
 
     CUBIC = 1
     """p0 s**3."""

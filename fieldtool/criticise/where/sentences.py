@@ -20,7 +20,15 @@ CHANGED = 1.6
 """Ratio of the errors of early and late data from which it is said that something changed."""
 GROWS = 0.3
 """Exponent by which the relative error grows or falls with the amplitude, from which it is said."""
-SIMPLE = ("direction", "one frequency", "large torque", "speed", "position", "other axes", "own motion")
+SIMPLE = (
+    "direction",
+    "one frequency",
+    "large torque",
+    "speed",
+    "position",
+    "other axes",
+    "own motion",
+)
 """Views from the simplest on."""
 
 
@@ -93,9 +101,7 @@ def experiment_errors(parts: Parts) -> tuple[LevelError, ...]:
     for name in dict.fromkeys(lines.span.experiment for lines, _ in parts):
         mine = [(lines, v) for lines, v in parts if lines.span.experiment == name]
         axes = range(mine[0][0].weight.shape[1])
-        torque = tuple(
-            float(np.sqrt(np.mean(np.var(lines.motion.torque[:, a])))) for lines, _ in mine[:1] for a in axes
-        )
+        torque = tuple(float(np.std(mine[0][0].motion.torque[:, a])) for a in axes)
         out.append(LevelError(name, torque, tuple(relative_error(mine, a) for a in axes)))
     return tuple(out)
 
@@ -166,16 +172,16 @@ def _sentence(
     band: tuple[float, float],
 ) -> str:
     name = context.axes[axis].name
-    if noise is not None and error < 1.5 * noise:  # noqa: PLR2004
-        return f"{name}: the torque is explained to {_percent(error)}; its noise is {_percent(noise)}"
+    if noise is not None and error < 1.5 * noise:
+        return (
+            f"{name}: the torque is explained to {_percent(error)}; its noise is {_percent(noise)}"
+        )
     clause = _follows(views)
     if not clause:
         clause = f"most of it lies between {band[0]:.3g} and {band[1]:.3g} Hz"
     extra = _in_time(parts, axis) or _with_amplitude(parts, axis)
     beyond = f" (noise {_percent(noise)})" if noise is not None else ""
-    return f"{name}: {_percent(error)} of the torque is not explained{beyond}; it {clause}{extra}".replace(
-        "it most of it", "most of it"
-    )
+    return f"{name}: {_percent(error)} of the torque is not explained{beyond}; {clause}{extra}"
 
 
 def _follows(views: Sequence[View]) -> str:
@@ -184,12 +190,12 @@ def _follows(views: Sequence[View]) -> str:
         return ""
     alike = [v for v in showing if v.share > showing[0].share - ALIKE]
     best = min(alike, key=lambda v: SIMPLE.index(v.name))
-    return f"{best.words} ({100 * best.share:.0f} % of it)"
+    return f"it {best.words} ({100 * best.share:.0f} % of it)"
 
 
 def _in_time(parts: Parts, axis: int) -> str:
     """Early against late experiments or stretches."""
-    if len(parts) < 4:  # noqa: PLR2004
+    if len(parts) < 4:
         return ""
     ordered = sorted(parts, key=lambda p: p[0].motion.clock[p[0].span.start])
     half = len(ordered) // 2
@@ -205,7 +211,12 @@ def _with_amplitude(parts: Parts, axis: int) -> str:
     levels = experiment_errors(parts)
     torque = np.array([level.torque[axis] for level in levels])
     error = np.array([level.error[axis] for level in levels])
-    if torque.size < 2 or torque.min() <= 0 or torque.max() < 1.5 * torque.min() or error.min() <= 0:  # noqa: PLR2004
+    if (
+        torque.size < 2
+        or torque.min() <= 0
+        or torque.max() < 1.5 * torque.min()
+        or error.min() <= 0
+    ):
         return ""
     slope = float(np.polyfit(np.log(torque), np.log(error), 1)[0])
     if slope < -GROWS:

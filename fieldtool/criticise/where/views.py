@@ -90,7 +90,7 @@ def _share(context: Context, axis: int, courses: Sequence[FloatArray]) -> float:
     return max(0.0, 1.0 - left / max(float(b @ b), 1e-300))
 
 
-def _direction(context: Context, axis: int, motion: Motion) -> FloatArray:
+def _direction(_: Context, axis: int, motion: Motion) -> FloatArray:
     return np.column_stack([np.sign(motion.smooth_velocity[:, axis]), np.ones(motion.rows)])
 
 
@@ -122,7 +122,9 @@ def _position(context: Context, axis: int, motion: Motion) -> FloatArray:
     q, square = motion.position[:, axis], motion.smooth_velocity[:, axis] ** 2
     columns = [f(order * q) for order in orders for f in (np.sin, np.cos)]
     columns += [square * f(order * q) for order in rising for f in (np.sin, np.cos)]
-    return np.column_stack([*columns, np.ones(motion.rows)]) if columns else np.zeros((motion.rows, 0))
+    return (
+        np.column_stack([*columns, np.ones(motion.rows)]) if columns else np.zeros((motion.rows, 0))
+    )
 
 
 def _large(context: Context, axis: int, motion: Motion) -> FloatArray:
@@ -132,11 +134,11 @@ def _large(context: Context, axis: int, motion: Motion) -> FloatArray:
     return np.column_stack([torque - np.clip(torque, -n, n) for n in nodes])
 
 
-def _own(context: Context, axis: int, motion: Motion) -> FloatArray:
+def _own(_: Context, axis: int, motion: Motion) -> FloatArray:
     return _linear(motion, [axis])
 
 
-def _others(context: Context, axis: int, motion: Motion) -> FloatArray:
+def _others(_: Context, axis: int, motion: Motion) -> FloatArray:
     return _linear(motion, [k for k in range(motion.position.shape[1]) if k != axis])
 
 

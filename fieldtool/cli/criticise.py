@@ -1,0 +1,145 @@
+"""``fieldtool criticise``: what the simulation gets wrong, why, and what is gained by knowing."""
+
+from pathlib import Path
+from types import TracebackType
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+from rich.table import Table
+from rich.text import Text
+
+from fieldtool import workflow
+from fieldtool.cli.output import console_of, print_json
+from fieldtool.criticise.criticism import Cause, Criticism
+
+STYLES = {
+    "adequate": "green",
+    "explained": "green",
+    "partly explained": "yellow",
+    "unexplained": "yellow",
+}
+HIDDEN = ("presliding", "rounding")
+"""Numbers that are shown only where the data determine them."""
+
+
+def criticise(
+    source: Annotated[Path, typer.Argument(help="Session folder, or recording (FILE.h5).")],
+    model: Annotated[
+        Path | None,
+        typer.Option("--model", help="model.yaml to criticise; the session's, or identified."),
+    ] = None,
+    picture: Annotated[
+        Path | None, typer.Option("--picture", help="Draw the errors before and after (FILE.png).")
+    ] = None,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print one JSON object and nothing else.")
+    ] = False,
+) -> None:
+    """Say what the simulation of a recording gets wrong, name causes, measure the gain."""
+    console = console_of(as_json)
+    with SearchBar(console) as bar:
+        found = workflow.criticise(source, model, picture, bar)
+    show_criticism(console, found.criticism)
+    if as_json:
+        print_json(
+            {"criticism": found.criticism.as_dict(), "model": found.criticism.model.as_dict()}
+        )
+
+
+class SearchBar:
+    """A bar with what is done and how long the rest may take; shown on terminals only."""
+
+    def __init__(self, console: Console) -> None:
+        self._bar = Progress(
+            TextColumn("  {task.description}"),
+            BarColumn(),
+            TaskProgressColumn(),
+            TimeRemainingColumn(),
+            console=console,
+            transient=True,
+            disable=not console.is_terminal,
+        )
+        self._task = self._bar.add_task("simulate", total=1.0)
+
+    def __enter__(self) -> "SearchBar":
+        self._bar.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._bar.stop()
+
+    def __call__(self, what: str, share: float) -> None:
+        """Show what is done."""
+        self._bar.update(self._task, completed=share, description=what)
+
+
+def show_criticism(console: Console, criticism: Criticism) -> None:
+    """Show where it is wrong, the causes with their numbers, the gain, and what is left."""
+    console.print(Text(f"Verdict: {criticism.verdict}", style=STYLES[criticism.verdict]))
+    for sentence in (*criticism.changes, *criticism.where):
+        console.print(Text(f"  {sentence}"))
+    if criticism.causes:
+        console.print(_causes(criticism.causes))
+        for cause in criticism.causes:
+            for tie in cause.ties:
+                axis = tie.axis if isinstance(tie.axis, str) else " - ".join(tie.axis)
+                console.print(
+                    Text(
+                        f"  {cause.effect} of {cause.axis_words}: {tie.effect} ({axis}, {tie.location}) "
+                        f"explains the data as well. To tell them apart, {tie.experiment}."
+                    )
+                )
+    for sentence in criticism.unexplained:
+        console.print(Text(f"  Unexplained: {sentence}"))
+    console.print(_gain(criticism))
+    for sentence in criticism.notes:
+        console.print(Text(f"  {sentence}"))
+
+
+def _causes(causes: tuple[Cause, ...]) -> Table:
+    table = Table(box=None, padding=(0, 2))
+    for title in ("cause", "axis", "where", "numbers", "explains"):
+        table.add_column(title, overflow="fold")
+    for c in causes:
+        numbers = "\n".join(
+            f"{name} {n.value:.4g} +- {1.96 * n.std:.2g} {n.unit}"
+            if n.std == n.std
+            else f"{name} {n.value:.4g} {n.unit}"
+            for name, n in c.parameters.items()
+            if n.std == n.std or name not in HIDDEN
+        )
+        gain = f"{100 * c.gain:.2g} % of the torque"
+        table.add_row(Text(c.effect), Text(c.axis_words), Text(c.location), Text(numbers), gain)
+    return table
+
+
+def _gain(criticism: Criticism) -> Table:
+    held = criticism.held_out
+    table = Table(box=None, padding=(0, 2))
+    for title in (
+        "unseen data",
+        "torque error before",
+        "after",
+        "noise",
+        "position before",
+        "after",
+    ):
+        table.add_column(title)
+    for name, before in held.error_before.items():
+        after, noise = held.error_after[name], held.noise_floor[name]
+        table.add_row(
+            Text(name),
+            f"{100 * before.torque:.3g} %",
+            f"{100 * after.torque:.3g} %",
+            "not known" if noise is None else f"{100 * noise:.2g} %",
+            f"{100 * before.position:.2g} %",
+            f"{100 * after.position:.2g} %",
+        )
+    return table

@@ -1,0 +1,41 @@
+"""The numbers of a cause, as they are reported, with standard errors."""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from fieldtool.criticise.criticism import Number
+from fieldtool.criticise.effects.base import Effect
+from fieldtool.criticise.search.afterwards import place_of
+from fieldtool.criticise.search.fit import Fitted
+
+UNDETERMINED = 3.0
+"""Relative standard error from which it is said that a number is not known."""
+
+
+def numbers_of(fitted: Fitted, effect: Effect) -> Mapping[str, Number]:
+    """Return the numbers of a cause with standard errors, by first-order propagation."""
+    place = place_of(fitted.hypothesis, effect)
+    effect = fitted.hypothesis.effects[place]
+    values = dict(fitted.hypothesis.values[place])
+    lead = f"{place}:{effect.name}."
+    index = {n.removeprefix(lead): k for k, n in enumerate(fitted.names) if n.startswith(lead)}
+    out = {}
+    for name, (value, unit, depends) in effect.plain(values).items():
+        free = [d for d in depends if d in index]
+        if not free:
+            out[name] = Number(float(value), float("nan"), unit)
+            continue
+        gradient = []
+        for d in free:
+            step = 1e-4 * max(abs(values[d]), 1e-12)
+            moved = effect.plain({**values, d: values[d] + step})[name][0]
+            gradient.append((moved - value) / step)
+        rows = [index[d] for d in free]
+        g = np.array(gradient)
+        variance = float(g @ fitted.covariance[np.ix_(rows, rows)] @ g)
+        std = float(np.sqrt(max(variance, 0.0)))
+        if not std < UNDETERMINED * max(abs(float(value)), 1e-300):
+            std = float("nan")
+        out[name] = Number(float(value), std, unit)
+    return out

@@ -1,0 +1,81 @@
+"""What a fitted hypothesis gains on data that no fit has seen, axis by axis."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fieldtool.criticise.effects.base import Effect
+from fieldtool.criticise.evidence.lines import Lines
+from fieldtool.criticise.search.fit import Fitted
+from fieldtool.criticise.search.hypothesis import Simulator
+from fieldtool.criticise.search.rules import Tried
+from fieldtool.criticise.search.significance import Comparison, compared
+
+FloatArray = NDArray[np.float64]
+Parts = Sequence[tuple[Lines, FloatArray]]
+UNSURE_NOISE = 0.25
+"""Of the power of an error, that may be noise though the estimate of the noise is smaller."""
+
+
+def judged(simulator: Simulator, fitted: Fitted, effect: Effect, before: Parts) -> Tried:
+    """Measure what a fitted hypothesis with an effect gains over what was before, on unseen data."""
+    after = simulator.parts(fitted.hypothesis, "unseen")
+    axes = [effect.axis] if effect.other is None else [effect.axis, effect.other]
+    there = sum(axis_power(before, axis) for axis in axes)
+    gained = there - sum(axis_power(after, axis) for axis in axes)
+    noise = sum(expected_noise(before, axis) for axis in axes)
+    share = gained / max(there - noise, UNSURE_NOISE * there, 1e-300)
+    return Tried(
+        fitted,
+        effect,
+        compared(before, after),
+        share,
+        explained_torque(before, after, effect.axis),
+        beyond_noise(before, axes),
+    )
+
+
+def difference(simulator: Simulator, worse: Fitted, better: Fitted) -> Comparison:
+    """Compare two fits on unseen data."""
+    return compared(
+        simulator.parts(worse.hypothesis, "unseen"), simulator.parts(better.hypothesis, "unseen")
+    )
+
+
+def beyond_noise(parts: Parts, axes: Sequence[int]) -> float:
+    """Return the power of the errors of some axes over that of noise; infinite where that is unknown."""
+    there = sum(axis_power(parts, axis) for axis in axes)
+    noise = sum(expected_noise(parts, axis) for axis in axes)
+    return there / noise if noise else float("inf")
+
+
+def axis_power(parts: Parts, axis: int) -> float:
+    """Sum of squares of the weighted errors of one axis."""
+    return sum(
+        float(np.sum(values.reshape(2, *lines.weight.shape)[:, :, axis] ** 2))
+        for lines, values in parts
+    )
+
+
+def expected_noise(parts: Parts, axis: int) -> float:
+    """Return what noise alone makes of :func:`axis_power`; 0 where the noise is not known."""
+    return sum(
+        float(np.count_nonzero(lines.weight[:, axis]))
+        for lines, _ in parts
+        if lines.span.periods > 1
+    )
+
+
+def explained_torque(before: Parts, after: Parts, axis: int) -> float:
+    """RMS of what is explained over RMS of the torque, of one axis, in the band."""
+    gained = whole = 0.0
+    for (lines, first), (_, second) in zip(before, after, strict=True):
+        counted = lines.weight[:, axis] > 0
+        weight = np.where(counted, lines.weight[:, axis], np.inf)
+        for values, sign in ((first, 1.0), (second, -1.0)):
+            both = values.reshape(2, *lines.weight.shape)[:, :, axis] / weight
+            gained += sign * float(np.sum(both**2))
+        torque = lines.raw(lines.motion.torque)[:, axis]
+        whole += float(np.sum(np.abs(torque) ** 2))
+    return float(np.sqrt(max(gained, 0.0) / max(whole, 1e-300)))

@@ -1,0 +1,161 @@
+"""Criticise what was measured: from a session folder or a recording to a criticism."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+from drives.errors import UserStopError
+from drives.profile import load_machine
+from fieldtool.criticise.criticise import Criticised, criticise
+from fieldtool.criticise.criticism import Criticism
+from fieldtool.errors import NotEnoughDataError
+from fieldtool.identify.recorded import identify_recording
+from fieldtool.records.model import MachineModel
+from fieldtool.records.model_file import read_model, write_model
+from fieldtool.records.recording import load
+from fieldtool.records.session_folder import SessionFolder
+from fieldtool.records.yaml_file import write_yaml
+from fieldtool.report.criticism_picture import draw_criticism
+from fieldtool.workflow.models import prior_model
+from fieldtool.workflow.session import Session
+
+Advance = Callable[[str, float], None]
+KNOWN = 0.3
+"""Relative standard error up to which a mass or spring of the extended model replaces the old one."""
+
+
+def criticise_source(
+    source: Path,
+    model_file: Path | None = None,
+    picture: Path | None = None,
+    advance: Advance = lambda *_: None,
+) -> Criticised:
+    """Criticise the model of a session folder, or of a recording.
+
+    Parameters
+    ----------
+    source : Path
+        Session folder, or recording (FILE.h5).
+    model_file : Path, optional
+        model.yaml to criticise; the session's otherwise; identified first where there is none.
+    picture : Path, optional
+        PNG file to draw; a session folder always gets one.
+    advance : callable
+        Told what is done, and a number from 0 to 1.
+
+    Raises
+    ------
+    FileFormatError
+        If there is no recording, or the model is none.
+    NotEnoughDataError, IdentificationError
+        If the data do not allow it.
+    """
+    folder = SessionFolder(source) if source.is_dir() else None
+    recording = load(folder.recording if folder else source)
+    prior = None
+    if folder and folder.machine.is_file():
+        prior = prior_model(load_machine(folder.machine))
+    if model_file is not None:
+        model = read_model(model_file)
+    elif folder and folder.model.is_file():
+        model = read_model(folder.model)
+    else:
+        advance("identify", 0.0)
+        model = identify_recording(recording, {}, prior).model
+    found = criticise(recording, model, _alike(prior, model), advance=advance)
+    if folder:
+        keep(folder, found, model)
+    if picture is not None:
+        draw_criticism(found, picture)
+    return found
+
+
+def criticised(
+    session: Session, model: MachineModel, stop_requested: Callable[[], bool]
+) -> tuple[MachineModel, Criticism | None]:
+    """Criticise within a session; return the model that later stages use, and the criticism.
+
+    A criticism that can not be made stops no session: what was identified stands.
+
+    Raises
+    ------
+    UserStopError
+        If the user asked for a stop; no axis moves at this stage.
+    """
+
+    def advance(_what: str, _share: float) -> None:
+        if stop_requested():
+            raise UserStopError(
+                "stopped by the user while the simulation was criticised; no axis was moving, "
+                "nothing was written"
+            )
+
+    session.screen.stage("Criticise the simulation: what it gets wrong, and why")
+    prior = _alike(prior_model(session.machine), model)
+    try:
+        found = criticise(load(session.folder.recording), model, prior, advance=advance)
+    except NotEnoughDataError as error:
+        session.warn(f"The simulation was not criticised: {error}")
+        return model, None
+    criticism = found.criticism
+    keep(session.folder, found, model)
+    session.screen.say(f"Verdict: {criticism.verdict}.")
+    for sentence in (*criticism.changes, *criticism.where, *cause_sentences(criticism)):
+        session.screen.say(sentence)
+    return final_model(found, model), criticism
+
+
+def cause_sentences(criticism: Criticism) -> tuple[str, ...]:
+    """Return one sentence a cause, with its numbers, and one for what is left."""
+    out = []
+    for c in criticism.causes:
+        numbers = ", ".join(f"{n} {v.value:.4g} {v.unit}" for n, v in c.parameters.items())
+        tie = f"; as well: {', '.join(t.effect for t in c.ties)}" if c.ties else ""
+        out.append(
+            f"Cause: {c.effect} of {c.axis_words} ({c.location}): {numbers}; explains "
+            f"{100 * c.gain:.2g} % of the torque on unseen data{tie}."
+        )
+    return (*out, *(f"Unexplained: {sentence}." for sentence in criticism.unexplained))
+
+
+def keep(folder: SessionFolder, found: Criticised, model: MachineModel) -> None:
+    """Write the criticism and its picture; where a cause is new, the extended model as well."""
+    write_yaml(folder.criticism, found.criticism.as_dict())
+    draw_criticism(found, folder.criticism_picture)
+    extended = final_model(found, model)
+    if extended is not model:
+        write_model(extended, folder.model)
+    folder.note(
+        "criticised",
+        verdict=found.criticism.verdict,
+        causes=[f"{c.effect} of {c.axis_words}" for c in found.criticism.causes],
+    )
+
+
+def final_model(found: Criticised, model: MachineModel) -> MachineModel:
+    """Return the model that later stages use: extended where criticism found what it has not.
+
+    Where the identification had the same effects, its numbers stand: it uses all data at once.
+    """
+    had = {(e.get("effect"), e.get("axis")) for e in model.effects}
+    had |= {
+        ("viscous_friction", axis.name)
+        for axis in model.axes
+        if axis.viscous_friction.value != 0.0 or axis.load_friction.value != 0.0
+    }
+    had |= {("coupling_inertia", c.axes) for c in model.couplings}
+    new = [c for c in found.criticism.causes if (c.effect, c.axis) not in had]
+    extended = found.criticism.model
+    if not new:
+        return model
+    known = all(
+        e.std < KNOWN * e.value for axis in extended.axes for e in (*axis.masses, *axis.springs)
+    )
+    return extended if known else replace(model, effects=extended.effects)
+
+
+def _alike(prior: MachineModel | None, model: MachineModel) -> MachineModel | None:
+    """Return the prior model if it is of the same axes, without effects."""
+    if prior is None or prior.names != model.names:
+        return None
+    return replace(prior, effects=())
