@@ -489,7 +489,7 @@ def simulate(
 ) -> None:
     """Serve the simulated machine's nodes in real time on a bus, until Ctrl-C."""
     console = console_of(False)
-    with stop_key() as key:
+    with stop_key("Ending ...") as key:
         profile = on_bus(machine, interface, channel, bitrate)
         served = workflow.simulate(profile, key, console.print)
     console.print(served)

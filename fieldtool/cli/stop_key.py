@@ -23,8 +23,9 @@ class StopKey:
     other time the work in hand is broken off at once, and what it had changed is put back.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, answer: str = "Stopping all axes ...") -> None:
         self.pressed = False
+        self._answer = answer
         self._asked = -ASKED_WITHIN
 
     def __call__(self) -> bool:
@@ -38,7 +39,7 @@ class StopKey:
             return
         self.pressed = True
         if monotonic() - self._asked <= ASKED_WITHIN:
-            sys.stderr.write("\nStopping all axes ...\n")
+            sys.stderr.write(f"\n{self._answer}\n")
             return
         raise UserStopError(STOPPED_AT_REST)
 
@@ -49,9 +50,9 @@ class StopKey:
 
 
 @contextmanager
-def stop_key() -> Iterator[StopKey]:
+def stop_key(answer: str = "Stopping all axes ...") -> Iterator[StopKey]:
     """Make Ctrl-C, and the request to end, a request to stop, for as long as this lasts."""
-    key = StopKey()
+    key = StopKey(answer)
     before = signal.signal(signal.SIGINT, key.on_signal)
     before_term = signal.signal(signal.SIGTERM, key.on_signal)
     try:

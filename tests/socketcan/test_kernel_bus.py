@@ -1,6 +1,7 @@
 """What only the kernel's own bus has: time stamps, filters, overruns, links that are down."""
 
 import contextlib
+import errno
 import os
 import pty
 import shutil
@@ -13,6 +14,7 @@ from pathlib import Path
 import can
 import numpy as np
 import pytest
+from can.interfaces.socketcan.socketcan import SocketcanBus
 
 from drives.bus import open_bus
 from drives.bus.kernel_bus import KernelBus
@@ -131,6 +133,25 @@ def test_an_interface_that_is_down_or_missing_is_refused(up_again) -> None:
         opened()
     with pytest.raises(BusError, match=r"vcan7 does not exist; CAN interfaces .*: vcan0, vcan1"):
         opened("vcan7")
+
+
+def test_a_transmit_queue_that_is_full_for_a_moment_is_waited_for(monkeypatch) -> None:
+    """vcan has no queue, so what the kernel says of a full one is put in its place."""
+    send, full = SocketcanBus.send, [3]
+
+    def queued(self, msg, timeout=None):
+        if full[0]:
+            full[0] -= 1
+            raise can.CanOperationError("Failed to transmit: no room", errno.ENOBUFS)
+        send(self, msg, timeout)
+
+    monkeypatch.setattr(SocketcanBus, "send", queued)
+    with opened() as near, opened() as far:
+        far.send(frame(0x123))
+        assert near.recv(1.0) is not None
+        full[0] = 10**9
+        with pytest.raises(BusError, match=r"transmit queue of vcan1 is full.*txqueuelen 1000"):
+            Line(far).send(frame(0x123))
 
 
 def test_an_interface_that_goes_down_is_noticed(up_again) -> None:
