@@ -268,7 +268,7 @@ def next_step(journal: Journal, given_up: Collection[str] = ()) -> Step | None:
 
 def _has_to_store(journal: Journal, record: DriveRecord) -> bool:
     if journal.goal is Goal.NEW:
-        return journal.storing is Storing.ALL
+        return journal.storing is Storing.ALL and bool(record.entries)
     return _must_store(journal, record)
 
 

@@ -154,6 +154,17 @@ def test_what_was_stored_survives_a_power_cycle_as_the_tool_said(session):
     )
 
 
+def test_a_drive_that_is_not_in_the_tuning_does_not_store(session):
+    """Storing keeps all that its working memory holds: that is nobody's business here."""
+    write_tuning(session, NEW, axes=("arm",))
+    session.machine.node(TABLE).dictionary.write(0x6065, 0, 777)
+    assert write(session, "--store").code == 0
+    power_cycle(session)
+    assert held(session, ARM) == NEW_RAW
+    assert session.machine.node(TABLE).memory.stored == {}
+    assert TABLE not in session.changed()
+
+
 def test_a_store_that_fails_takes_the_others_back(session):
     """The one whose memory is broken is named; all work with their old values."""
     session.inject(StoreFails(ARM))
