@@ -39,7 +39,8 @@ class Transaction:
     Parameters
     ----------
     drives
-        All of them, identified and disabled.
+        All of them, identified and disabled.  Without some of the journal's, it can not end: nothing
+        but bringing the others back makes sense then.
     journal
         How far it has come.
     backup
@@ -64,7 +65,9 @@ class Transaction:
         self._save = save
         self.journal = journal
         self._begun = False
-        self.outcomes = {r.axis: DriveOutcome(r.axis, r.node_id) for r in journal.drives}
+        here = [record for record in journal.drives if record.axis in self._drives]
+        self.outcomes = {record.axis: DriveOutcome(record.axis, record.node_id) for record in here}
+        self._left_out = {record.axis for record in journal.drives} - self._drives.keys()
         self.unsaved: OSError | None = None
         """Why the journal could not be saved on the way back."""
 
@@ -197,7 +200,7 @@ class Transaction:
             self._go_quietly(self.journal.turned_back(distrust=True))
 
     def _back(self, *, whole: bool) -> None:
-        given_up: set[str] = set()
+        given_up = set(self._left_out)
         for outcome in self.outcomes.values():
             outcome.trouble = ""
         while (step := next_step(self.journal, given_up)) is not None:
@@ -218,8 +221,10 @@ class Transaction:
                 given_up.add(step.axis)
                 continue
             self._go_quietly(self.journal.ended(step))
-        for record in self.journal.drives:
-            self.outcomes[record.axis].memory = record.memory
+        if self._left_out and given_up == self._left_out:
+            self._check_back(given_up)  # what the finish would have done
+        for axis, outcome in self.outcomes.items():
+            outcome.memory = self._record(axis).memory
 
     def _bring_back(self, axis: str, *, whole: bool) -> None:
         outcome = self.outcomes[axis]

@@ -441,6 +441,13 @@ def restore(
             help="You know that drives without a serial number are those of the backup.",
         ),
     ] = False,
+    without: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--without",
+            help="Leave this axis as it is: its drive is gone or was exchanged; may be repeated.",
+        ),
+    ] = None,
     trace: TraceWanted = False,
     trace_file: TraceFile = None,
     as_json: Json = False,
@@ -453,7 +460,9 @@ def restore(
     console = console_of(as_json)
     with stop_key(), TerminalScreen(console) as screen:
         profile = on_bus(machine, interface, channel, bitrate)
-        restored = workflow.restore(profile, backup, store, traced, same_drives, screen)
+        restored = workflow.restore(
+            profile, backup, store, traced, same_drives, without or (), screen
+        )
     show_restored(console, restored)
     if as_json:
         print_json(restored.as_dict())

@@ -39,7 +39,11 @@ def sentences(restored: Restored) -> list[str]:
     """Return what there is to say below the table."""
     count = len(restored.written)
     said = []
-    if restored.cut_off is not None:
+    if restored.left_out:
+        said.append(
+            f"Left as they are: {', '.join(restored.left_out)}. The other drives hold the old values."
+        )
+    elif restored.cut_off is not None:
         said.append(
             f"The {'write' if restored.had_write else 'measurement'} that began at "
             f"{restored.cut_off.begun} had been cut off. It was taken back: all drives hold the old "

@@ -1,14 +1,14 @@
 """Whole sessions, and each stage alone: from the session folder to the session folder."""
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 
 from drives.bus import not_imitated
 from drives.canopen_drive import CanopenGroup, connect
 from drives.canopen_drive.group import profile_of
-from drives.errors import NotSupportedError, UserStopError
+from drives.errors import NotSupportedError, ProfileError, UserStopError
 from drives.parameters import Change
 from drives.profile import MachineProfile, load_machine
 from fieldtool.design.tuning import Tuning, design
@@ -236,6 +236,7 @@ def restore(
     store: bool = False,
     trace: Path | None = None,
     same_drives: bool = False,
+    without: Collection[str] = (),
     screen: Screen | None = None,
 ) -> Restored:
     """Bring a backup back into a machine's drives, or take back a write that was cut off.
@@ -252,6 +253,8 @@ def restore(
         File that every frame is noted in; none where it is None.
     same_drives
         The user's word that drives without a serial number are those of the backup.
+    without
+        Axes that are left as they are: their drives are gone, or were exchanged.
     screen
         Is told what happens.
 
@@ -263,6 +266,11 @@ def restore(
     screen = screen or Quiet()
     source = source_of(backup, store)
     profile = machine if isinstance(machine, MachineProfile) else load_machine(machine)
+    lacking = [axis for axis in without if axis not in {a.name for a in profile.axes}]
+    if lacking:
+        raise ProfileError(profile.path, f"has no axis {', '.join(lacking)} to leave out")
+    axes = tuple(axis for axis in profile.axes if axis.name not in without)
+    profile = profile.model_copy(update={"axes": axes})
     screen.stage(f"Connect to {profile.name}")
     with connect(profile, trace=trace, to_move=False) as group:
         screen.stage("Bring the old parameters back")
@@ -272,6 +280,7 @@ def restore(
             source,
             store=store,
             same_drives=same_drives,
+            without=without,
             say=screen.say,
         )
 

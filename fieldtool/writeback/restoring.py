@@ -1,6 +1,6 @@
 """Bring a backup back, or take a write back that was cut off."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -62,6 +62,8 @@ class Restored:
     outcomes: tuple[DriveOutcome, ...]
     had_write: bool
     """Whether there is a journal that says what old and new values are."""
+    left_out: tuple[str, ...]
+    """Axes that were not brought back, because the user said so."""
     notes: tuple[str, ...]
 
     @property
@@ -82,6 +84,7 @@ class Restored:
             "begun": self.cut_off.begun if self.cut_off else None,
             "backup": str(self.backup),
             "stored": self.stored,
+            "left_out": list(self.left_out),
             "drives": [
                 {
                     "axis": outcome.axis,
@@ -144,6 +147,7 @@ def bring_back(
     *,
     store: bool = False,
     same_drives: bool = False,
+    without: Collection[str] = (),
     say: Callable[[str], None] = lambda _: None,
 ) -> Restored:
     """Bring all parameters of a backup back into all its drives, and store them where that is needed.
@@ -161,6 +165,8 @@ def bring_back(
         hold new values store the old ones in any case.
     same_drives
         The user's word that drives without a serial number are those of the backup.
+    without
+        Axes that are left as they are: their drives are gone, or were exchanged.
     say
         Is told what is done with which drive.
 
@@ -172,12 +178,18 @@ def bring_back(
         If a value could not be restored or stored; every other one was.
     """
     before = source.journal
+    parts = tuple(part for part in source.backup.drives if part.axis not in without)
+    if not parts:
+        raise ProfileError(source.backup_path, "holds no other axis. Nothing was written.")
     journal = journal_back(machine, source, store)
-    check_same_drives(drives, source.backup.drives, "backup", trusted=same_drives)
+    check_same_drives(drives, parts, "backup", trusted=same_drives)
+    if before is not None and before.is_open:
+        there = tuple(record for record in before.drives if record.axis not in without)
+        check_same_drives(drives, there, "write journal", trusted=same_drives)
     by_axis = {drive.axis: drive for drive in drives}
     notes = []
-    for part, record in zip(source.backup.drives, journal.drives, strict=True):
-        drive = by_axis[part.axis]
+    for part in parts:
+        drive, record = by_axis[part.axis], journal.drive(part.axis)
         check_objects(drive, (h.info for h in part.held), source.backup_path, "backup")
         journal_path = source.backup_path.with_name(JOURNAL)
         check_objects(drive, (e.info for e in record.entries), journal_path, "write journal")
@@ -188,10 +200,10 @@ def bring_back(
                 f"{part.axis}: the backup was made with firmware revision "
                 f"0x{part.revision_number:08X}, the drive now has 0x{drive.identity.revision:08X}."
             )
-    check_disabled(by_axis[part.axis] for part in source.backup.drives)
-    taking_part = [by_axis[part.axis] for part in source.backup.drives]
+    taking_part = [by_axis[part.axis] for part in parts]
+    check_disabled(taking_part)
     keeper = JournalKeeper(source.backup_path.with_name(JOURNAL))
-    counts = {part.axis: len(part.held) for part in source.backup.drives}
+    counts = {part.axis: len(part.held) for part in parts}
 
     def tell(step: Step) -> None:
         if step.action is Action.BRING_BACK:
@@ -203,6 +215,7 @@ def bring_back(
         transaction.restore()
     except OSError as error:
         raise not_kept(keeper, error) from error
+    keeper.settle(transaction.journal)
     if transaction.unsaved is not None:
         notes.append(
             f"{transaction.unsaved} The drives are in order, but the journal does not say so: run "
@@ -213,6 +226,7 @@ def bring_back(
         before if before is not None and before.is_open else None,
         tuple(transaction.outcomes.values()),
         had_write=journal.writes,
+        left_out=tuple(p.axis for p in source.backup.drives if p.axis in without),
         notes=tuple(notes),
     )
 

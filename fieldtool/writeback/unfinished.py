@@ -17,7 +17,7 @@ from pathlib import Path
 import yaml
 
 from drives.errors import ProfileError
-from drives.parameters import Journal, load_journal, save_journal
+from drives.parameters import Journal, Phase, load_journal, save_journal
 from drives.parameters.durable import remove_durably, write_durably
 from drives.parameters.guard import Recorded
 from drives.parameters.values import ParameterDrive
@@ -62,6 +62,13 @@ class JournalKeeper:
         elif not journal.is_open:
             for record in journal.drives:
                 remove_durably(_note_of(journal.machine, record))
+
+    def settle(self, journal: Journal) -> None:
+        """Remove the notes of drives that are in order, where others of the journal are not."""
+        with suppress(OSError):
+            for record in journal.drives:
+                if record.phase is Phase.ROLLED_BACK:
+                    remove_durably(_note_of(journal.machine, record))
 
     def forget(self, journal: Journal) -> None:
         """Remove journal and notes, because nothing is left to be taken back.
@@ -133,9 +140,10 @@ def refuse_unfinished(machine: str, drives: Sequence[ParameterDrive], session: P
         if note.exists():
             folder = _folder_of(note)
             journal = _journal(folder / JOURNAL, note)
-            if journal.is_open:
+            if not journal.is_open:
+                remove_durably(note)
+            elif _concerns(journal, one, same_place=True):
                 raise _refusal(folder, one.axis, journal)
-            remove_durably(note)
     for journal_file in (session / JOURNAL, *_neighbours(session)):
         if journal_file.is_file() and _may_be_open(journal_file):
             own = journal_file.parent == session
@@ -233,12 +241,21 @@ def _open_journal(journal_file: Path, *, own: bool) -> Journal | None:
 
 
 def _same_drive(journal: Journal, drives: Iterable[_Identified], *, own: bool) -> str | None:
-    """Return the axis of one of these drives that a journal holds."""
-    for drive in drives:
-        for record in journal.drives:
-            known = (record.vendor_id, record.product_code, record.serial_number)
-            if known == (drive.vendor_id, drive.product_code, drive.serial_number) and (
-                drive.serial_number or (record.node_id == drive.node_id and own)
-            ):
-                return drive.axis
-    return None
+    """Return the axis of one of these drives that a journal holds and that is not in order."""
+    return next((d.axis for d in drives if _concerns(journal, d, same_place=own)), None)
+
+
+def _concerns(journal: Journal, drive: _Identified, *, same_place: bool) -> bool:
+    """Whether an open journal holds this drive, and it was not brought back.
+
+    Drives without a serial number are told by their node id, where the place is known to be the same.
+    """
+    for record in journal.drives:
+        known = (record.vendor_id, record.product_code, record.serial_number)
+        if (
+            known == (drive.vendor_id, drive.product_code, drive.serial_number)
+            and (drive.serial_number or (same_place and record.node_id == drive.node_id))
+            and record.phase is not Phase.ROLLED_BACK
+        ):
+            return True
+    return False

@@ -387,3 +387,44 @@ def test_drives_without_a_serial_number_need_the_users_word(make_bench, monkeypa
     assert bench.command("restore", bench.out, "--same-drives").code == 0
     assert bench.changed() == {}
     assert notes() == []
+
+
+# --- drives that are gone ------------------------------------------------------------------------
+
+
+def test_a_drive_that_was_exchanged_is_left_out_and_the_others_come_back(session, cut_off):
+    """Its serial number stays noted: if the same drive comes back, it is brought in order then."""
+    cut_off(2 * PER_DRIVE + 2, store=True)
+    arm = session.machine.node(ARM).dictionary
+    arm.force(0x1018, 4, 4242)
+    refused = session.command("restore", session.out)
+    assert refused.code == 3
+    assert "serial number 1012, this one has 4242" in refused.err
+    outcome = session.command("restore", session.out, "--without", "arm", "--json")
+    assert outcome.code == 0, outcome.err
+    assert json.loads(outcome.out)["left_out"] == ["arm"]
+    assert "Left as they are: arm" in in_one_line(outcome.err)
+    assert session.changed(ARM) == {}, "the table has its old values"
+    assert ARM in session.changed(), "the arm was not touched"
+    other = session.folder / "far" / "away"
+    make_session(session, other)
+    assert session.command("write", other, "--yes").code == 0, "this arm is in nobody's journal"
+    arm.force(0x1018, 4, 1012)
+    again = session.folder / "far" / "again"
+    make_session(session, again)
+    assert f"fieldtool restore {session.out}" in session.command("write", again, "--yes").err
+    assert session.command("restore", session.out).code == 0
+    power_cycle(session)
+    assert session.changed() == {}
+    assert notes() == []
+
+
+def test_a_drive_that_is_dead_is_left_out_and_the_others_come_back(session, cut_off):
+    cut_off(PER_DRIVE + 2)
+    session.inject(NodeVanishes(ARM))
+    assert session.command("restore", session.out).code == 3
+    assert session.command("restore", session.out, "--without", "arm").code == 0
+    assert session.changed(ARM) == {}
+    assert session.command("restore", session.out, "--without", "leg").code == 2
+    outcome = session.command("restore", session.out, "--without", "arm", "--without", "table")
+    assert outcome.code in (2, 3)
