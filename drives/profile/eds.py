@@ -24,6 +24,8 @@ from drives.objects import DATA_TYPES, DataType, ObjectAddress, ObjectInfo
 MAX_EDS_BYTES = 5_000_000
 """The largest files of real drives have about 1 MB."""
 MAX_OBJECTS = 0x10000
+FIRST_OBJECT = 0x1000
+"""Below are data types."""
 _MANDATORY = ("mandatoryobjects", "optionalobjects", "manufacturerobjects")
 _SECTION = re.compile(r"^\s*\[([^\]\r\n]*)\]", re.MULTILINE)
 _COMPACT = re.compile(r"^\s*(?:CompactSubObj|SubNumber|NrOfEntries)\s*=\s*(\S+)", re.M | re.I)
@@ -116,9 +118,9 @@ def _check_shape(path: Path, text: str) -> None:
 
 
 def variables(dictionary: ObjectDictionary) -> list[ODVariable]:
-    """Return all entries, by index and sub-index."""
+    """Return all entries, by index and sub-index; data types that only fill gaps in PDOs left out."""
     found: list[ODVariable] = []
-    for index in sorted(dictionary):
+    for index in sorted(i for i in dictionary if i >= FIRST_OBJECT):
         entry = dictionary[index]
         if isinstance(entry, ODRecord | ODArray):
             found += [entry.subindices[k] for k in sorted(entry.subindices)]

@@ -5,11 +5,18 @@ from pathlib import Path
 import pytest
 
 from drives import objects
+from drives.canopen_drive import CanopenDrive
+from drives.canopen_drive.line import Line
 from drives.canopen_drive.torque_offset import TORQUE_OFFSET
 from drives.objects import ObjectAddress
-from drives.profile import DriveProfile, load_drive, packaged
-from drives.profile.eds import info_at, read_eds, variable_at, variables, writable
+from drives.profile import DriveProfile, load_drive, load_machine, packaged
+from drives.profile.eds import info_at, read_eds, readable, variable_at, variables, writable
 from drives.profile.match import Presented, best_matches
+from drives.sim.faces.face import Face, FixedLoops
+from drives.sim.faces.merge import dressed
+from drives.sim.lockstep_bus import LockstepBus
+from drives.sim.machine import SimulatedDrive, SimulatedMachine
+from drives.sim.plant import ChainParameters
 
 EDS = Path(__file__).parents[3] / "shared" / "eds"
 REAL = sorted(p for p in EDS.glob("*") if p.suffix in (".eds", ".dcf")) if EDS.is_dir() else []
@@ -168,3 +175,59 @@ def test_the_check_sees_a_wrong_type_and_a_missing_object():
     assert "0x5555:01 is not in" in said
     assert "0x1010:01 is there" in said
     assert "0x608F:01 (encoder increments) is missing" in said
+
+
+@pytest.fixture
+def dressed_drive():
+    """Return a drive that shows the objects of an EDS file, as the host sees it, and its node."""
+    buses = []
+
+    def connect(path: Path):
+        described, hidden = dressed(path)
+        face = Face("dressed", FixedLoops, described, hidden)
+        chain = ChainParameters((0.02,), (), (), 0.0)
+        bus = LockstepBus(
+            machine=SimulatedMachine((SimulatedDrive("x", 5, chain, 4, 8, face=face),))
+        )
+        buses.append(bus)
+        axis = load_machine("turntable-arm").axes[0]
+        axis = axis.model_copy(update={"name": "x", "node_id": 5})
+        return CanopenDrive(Line(bus), axis, load_drive("cia402").with_eds(path)), bus.machine.node(
+            5
+        )
+
+    yield connect
+    for bus in buses:
+        bus.shutdown()
+
+
+@pytest.mark.skipif(not REAL, reason="no EDS files of real drives beside the project")
+@pytest.mark.parametrize("path", REAL, ids=lambda p: p.name)
+class TestSimulatedFromRealEds:
+    def test_the_host_reads_every_object_with_its_own_type(self, path, dressed_drive):
+        drive, node = dressed_drive(path)
+        count = 0
+        for variable in variables(drive.dictionary):
+            info = drive.info(ObjectAddress(variable.index, variable.subindex))
+            if info is None or not readable(variable):
+                continue
+            value = drive.read(info)  # raises if host and drive do not agree on its size
+            if not isinstance(value, str):
+                assert value == node.dictionary.read(variable.index, variable.subindex)
+            count += 1
+        assert count > 80
+
+    def test_what_the_file_does_not_have_is_not_there(self, path, dressed_drive):
+        drive, _ = dressed_drive(path)
+        for used in USED:
+            there = variable_at(drive.dictionary, used.address) is not None
+            assert (drive.read_optional(used) is not None) == there
+
+    def test_a_type_other_than_the_standards_is_taken_from_the_file(self, path, dressed_drive):
+        drive, node = dressed_drive(path)
+        own = drive.info(TORQUE_OFFSET.address)
+        if own is None or own.type == TORQUE_OFFSET.type:
+            pytest.skip("its torque offset is the standard's, or not there")
+        drive.write(TORQUE_OFFSET, -1234)  # INTEGER16 by name, INTEGER32 on the wire
+        assert node.dictionary.read(0x60B2, 0) == -1234
+        assert drive.read(TORQUE_OFFSET) == -1234

@@ -8,10 +8,15 @@ from pathlib import Path
 
 import pytest
 
+from drives.canopen_drive import connect
 from drives.errors import DrivesError, NotSupportedError
+from drives.parameters import back_up, save_backup
+from drives.sim.faces.others import PASSWORD
 from drives.sim.servo_kernel import Parameter
 from fieldtool import workflow
+from fieldtool.design.tuning import AxisTuning, Tuning
 from fieldtool.workflow import Options, SessionResult
+from fieldtool.writeback.transaction import changes_for
 from tests.faces import machine_of, simulated
 
 PAIRS = {
@@ -95,8 +100,6 @@ def test_gains_that_no_object_holds_are_designed_but_not_written(sessions):
 def test_writing_them_is_refused_and_touches_no_drive(tmp_path):
     machine = machine_of(("elmo-gold", "epos4-dual-loop"), tmp_path)
     from drives.canopen_drive import connect
-    from fieldtool.design.tuning import AxisTuning, Tuning
-    from fieldtool.writeback.transaction import changes_for
 
     gains = {"position_p": 10.0, "velocity_p": 1.0, "velocity_i": 5.0}
     tuning = Tuning(tuple(AxisTuning(n, gains, 1.5, "") for n in ("table", "arm")))
@@ -162,3 +165,31 @@ def test_what_is_not_known_is_asked_for_in_one_sentence(tmp_path, drive, change,
 def test_profiles_of_the_simulated_machine_stand_beside_it(tmp_path):
     machine = machine_of(("novanta*", "reference"), tmp_path)
     assert Path(machine.axes[0].drive).parent == tmp_path
+
+
+def test_gains_behind_a_password_are_backed_up_and_restored(tmp_path):
+    """Their units are not known, and need not be: what a drive held comes back as it was."""
+    machine = machine_of(("prbt", "reference"), tmp_path, table={"password": PASSWORD.decode()})
+    path = tmp_path / "parameters-before.yaml"
+    with simulated(machine) as running:
+        node = running.nodes[0]
+        node.dictionary.force(0x2030, 0, 2.5)
+        with connect(machine, to_move=False) as group:
+            save_backup(back_up(machine.name, group.drives), path)
+        node.dictionary.force(0x2030, 0, 7.0)
+        workflow.restore(machine.path, path)
+        assert node.dictionary.read(0x2030, 0) == 2.5
+    assert PASSWORD.decode() not in path.read_text()
+
+
+def test_without_the_password_nothing_is_restored_and_it_is_said(tmp_path):
+    machine = machine_of(("prbt", "reference"), tmp_path)
+    path = tmp_path / "parameters-before.yaml"
+    with simulated(machine) as running:
+        node = running.nodes[0]
+        with connect(machine, to_move=False) as group:
+            save_backup(back_up(machine.name, group.drives), path)
+        node.dictionary.force(0x2030, 0, 7.0)
+        with pytest.raises(DrivesError, match="Give `password` at the axis"):
+            workflow.restore(machine.path, path)
+        assert node.dictionary.read(0x2030, 0) == 7.0

@@ -198,3 +198,44 @@ def test_spoilt_files_are_read_or_refused_never_anything_else(tmp_path, data):
     else:
         said = ""
     assert "\n" not in said
+
+
+@settings(
+    max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(data=st.data())
+def test_spoilt_drive_profiles_are_read_or_refused_never_anything_else(tmp_path, data):
+    name = data.draw(st.sampled_from(packaged("drives")))
+    tree = yaml.safe_load((FOLDER / f"{name}.yaml").read_text(encoding="utf-8"))
+    junk = st.one_of(
+        st.none(),
+        st.booleans(),
+        st.integers(-(2**40), 2**40),
+        st.floats(),
+        st.sampled_from(["unknown", "own", "0x1", "1 ms", "x: y", "", "\u0000", "N m", "nan"]),
+        st.lists(st.integers(), max_size=3),
+        st.dictionaries(st.sampled_from(["object", "scale", "x"]), st.integers(), max_size=2),
+    )
+    for _ in range(data.draw(st.integers(1, 3))):
+        place = tree
+        while True:
+            keys = list(place) if isinstance(place, dict) else list(range(len(place)))
+            if not keys:
+                break
+            key = data.draw(st.sampled_from(keys))
+            if isinstance(place[key], dict | list) and data.draw(st.booleans()):
+                place = place[key]
+                continue
+            place[key] = data.draw(junk)
+            break
+    path = tmp_path / "spoilt.yaml"
+    path.write_text(yaml.safe_dump(tree, allow_unicode=True), encoding="utf-8")
+    try:
+        profile = load_drive(path)
+    except ProfileError as refused:
+        said = str(refused)
+    else:
+        said = ""
+        assert isinstance(profile.unknown, tuple)
+        assert isinstance(profile.tunable, frozenset)
+    assert "\n" not in said
