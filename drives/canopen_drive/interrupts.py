@@ -7,7 +7,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
+_HANG_UP = (signal.SIGHUP,) if hasattr(signal, "SIGHUP") else ()
+SIGNALS = (signal.SIGINT, signal.SIGTERM, *_HANG_UP)
+"""Ctrl-C, the request to end, and the terminal that was closed (not on Windows)."""
 
 
 @contextmanager

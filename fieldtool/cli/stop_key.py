@@ -3,12 +3,13 @@
 import signal
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from time import monotonic
 from types import FrameType
 
 import typer
 
+from drives.canopen_drive.interrupts import SIGNALS
 from drives.errors import UserStopError
 
 ASKED_WITHIN = 0.5
@@ -39,7 +40,8 @@ class StopKey:
             return
         self.pressed = True
         if monotonic() - self._asked <= ASKED_WITHIN:
-            sys.stderr.write(f"\n{self._answer}\n")
+            with suppress(OSError):  # the terminal may be gone
+                sys.stderr.write(f"\n{self._answer}\n")
             return
         raise UserStopError(STOPPED_AT_REST)
 
@@ -51,15 +53,22 @@ class StopKey:
 
 @contextmanager
 def stop_key(answer: str = "Stopping all axes ...") -> Iterator[StopKey]:
-    """Make Ctrl-C, and the request to end, a request to stop, for as long as this lasts."""
+    """Make Ctrl-C, the request to end, and a closed terminal a request to stop, while this lasts.
+
+    Who started the tool with ``nohup`` wants it to outlive the terminal: that is left so.
+    """
     key = StopKey(answer)
-    before = signal.signal(signal.SIGINT, key.on_signal)
-    before_term = signal.signal(signal.SIGTERM, key.on_signal)
+    heard = [
+        number
+        for number in SIGNALS
+        if number in (signal.SIGINT, signal.SIGTERM) or signal.getsignal(number) != signal.SIG_IGN
+    ]
+    before = {number: signal.signal(number, key.on_signal) for number in heard}
     try:
         yield key
     finally:
-        signal.signal(signal.SIGINT, before)
-        signal.signal(signal.SIGTERM, before_term)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def may_move(yes: bool) -> Callable[[str], bool] | None:

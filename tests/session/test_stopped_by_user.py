@@ -12,7 +12,7 @@ import pytest
 import yaml
 
 from drives.canopen_drive import CanopenDrive, CanopenMotion
-from drives.canopen_drive.interrupts import uninterrupted
+from drives.canopen_drive.interrupts import SIGNALS, uninterrupted
 from drives.errors import UserStopError
 from drives.sim.faults import Fault
 from fieldtool import workflow
@@ -68,7 +68,7 @@ def test_while_enabling(bench, monkeypatch):
     is_safe(bench)
 
 
-@pytest.mark.parametrize("signal_number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("signal_number", SIGNALS)
 @pytest.mark.parametrize("sweeping", [False, True])
 def test_while_axes_move(bench, sweeping, signal_number):
     press = Pressed(TABLE, signal_number)
