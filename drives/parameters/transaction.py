@@ -130,8 +130,10 @@ class Transaction:
             entry.info: entry.after if forward else entry.before
             for entry in self._record(drive.axis).entries
         }
-        if not forward:
-            wanted |= {held.info: held.value for held in self.outcomes[drive.axis].written}
+        if not forward:  # and of all that came back, what does not change by itself
+            known = {parameter.object for parameter in drive.profile.parameters.values()}
+            written = self.outcomes[drive.axis].written
+            wanted |= {h.info: h.value for h in written if h.info.address in known}
         for info, value in wanted.items():
             found = drive.read(info)
             if not same(info, found, value):
@@ -172,9 +174,14 @@ class Transaction:
         self._refuse_mixed(f"writing failed: {reason}. Not everything could be restored", cause)
         failed = self._begun if isinstance(cause, OSError) else not isinstance(cause, StoppedError)
         if failed and isinstance(cause, DrivesError | OSError):
+            unsaved = (
+                f" The journal does not say so ({self.unsaved}): run `fieldtool restore` once."
+                if self.unsaved
+                else ""
+            )
             raise WriteBackError(
                 f"{reason}. Nothing was changed: all parameters were restored and read back."
-                f"{self._stored_back()}"
+                f"{self._stored_back()}{unsaved}"
             ) from cause
 
     def restore(self) -> None:
