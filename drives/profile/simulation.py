@@ -24,7 +24,7 @@ class SimulatedAxisProfile(Part):
     torque_constant: Positive = 0.1
     """N m/A (or N/A) of the motor, for drives that know currents."""
     face: str | None = None
-    """Kind of drive that is simulated; else that of the axis' drive profile."""
+    """Kind of drive that is simulated; else that of the axis' drive profile, or the reference drive."""
     encoder_counts_per_rev: Annotated[int, Field(ge=16, le=2**30)] = 2**20
     gains: dict[str, Number] = Field(default_factory=dict)
     """Start values of the drive's parameters by name, physical units."""

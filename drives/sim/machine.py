@@ -32,7 +32,7 @@ from drives.sim.effects import (
     TorqueScale,
 )
 from drives.sim.entries import ENTRIES
-from drives.sim.faces import REFERENCE, Face, Motor, face_of
+from drives.sim.faces import REFERENCE, Face, Motor, face_names, face_of
 from drives.sim.faces.face import Loops
 from drives.sim.firmware import DriveHardware
 from drives.sim.plant import ChainParameters, PlantParameters
@@ -261,7 +261,9 @@ def simulated_machine(profile: "MachineProfile") -> SimulatedMachine:
                 serial=1000 + axis.node_id if serial is None else serial,
                 gains=truth.gains,
                 torque_constant=truth.torque_constant,
-                face=face_of(truth.face or _kind_of_drive(axis.drive, profile.path)),
+                face=face_of(truth.face)
+                if truth.face
+                else _face_of_drive(axis.drive, profile.path),
             )
         )
     couplings = tuple(
@@ -271,11 +273,12 @@ def simulated_machine(profile: "MachineProfile") -> SimulatedMachine:
     return SimulatedMachine(tuple(drives), couplings, simulation.seed, effects)
 
 
-def _kind_of_drive(name: str, beside: Path) -> str:
-    """Return the name of a drive profile, which may be given by its file."""
+def _face_of_drive(name: str, beside: Path) -> Face:
+    """Return the face of a drive profile's name; that of the reference drive for others' names."""
     from drives.profile import load_drive
 
-    return load_drive(name, beside).name
+    kind = load_drive(name, beside).name
+    return face_of(kind) if kind in face_names() else REFERENCE
 
 
 _PARTS: dict[str, type[ChainEffect]] = {
