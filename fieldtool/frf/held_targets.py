@@ -6,10 +6,19 @@ SYNC.  At the SYNCs the reference r lies on the wanted sine, between them it lie
 shows the bends, and is sampled always at the same place: just after a bend, by the lag d of the
 torque.  So
 
-    velocity_p position_p r (w T)^2 / 12 (1 - 6 (d / T) (1 - d / T))
+    velocity_p position_p r (w T)^2 / 12 share
 
-has to be taken off the sampled phasor.  At T = 4 ms and 8 Hz it is 0.2 % of the product of gains
-and reference; masses and springs come out 0.13 % too large without it.
+has to be taken off the sampled phasor.  If the lag were a pure delay, the share would be
+1 - 6 p (1 - p) with p = d / T; of a low-pass with the time constant d
+
+    1 - 3 a / pi coth(pi / a) + 3 a^2 / pi^2,     a = 2 pi p
+
+A current loop behind the drive's own cycle is something between: the mean is taken, and half the
+difference is how well it is known (:func:`bends_seen`); a fit may find it.  At T = 4 ms and 8 Hz the
+folded part is 0.2 % of the product of gains and reference; masses and springs come out 0.13 % too
+large without it.
+
+Source of the sums over all images: Gradshteyn and Ryzhik, 1.443 and 1.421.
 
 Valid for: T short against the velocity loop's response (velocity_p T well below the motor's mass),
 no low-pass near the SYNC rate, d below T.
@@ -30,6 +39,10 @@ LINEAR_TARGETS = "linear_targets"
 """Key of a recording's source: ``AXIS=LAG`` of the axes whose drives interpolate linearly, LAG the
 torque's lag in s, with blanks between; ``AXIS=LAG/SHARE`` where the drive feeds that share of the
 reference's velocity forward."""
+LEAST_UNSURE = 0.05
+"""Of the bends: error of the share that is seen where there is hardly a lag."""
+STAIR_UNSURE = 0.02
+"""Of a stair's step: error of what is seen of it."""
 
 
 def folded_torque(
@@ -81,7 +94,7 @@ def folded_phasors(
             continue
         # A target sent with one SYNC is reached at the next one.
         reached = reference[:, axis] * np.exp(-1j * omega * period)
-        lost = (omega * period) ** 2 * _lost(lag, period)
+        lost = (omega * period) ** 2 / 12 * _seen(lag / period)[0]
         folded[:, axis] = controller.velocity_p * controller.position_p * reached * lost
         share = shares(recording)[information.name]
         if share:
@@ -92,32 +105,51 @@ def folded_phasors(
     return folded
 
 
-def folded_course(recording: Recording, experiment: Experiment) -> FloatArray:
-    """Return the part of sampled torques that is folded images row by row, (n, M), N m or N.
+def bends(recording: Recording, experiment: Experiment) -> FloatArray:
+    """Return what torques would show of the bends without lag, row by row, (n, M), N m or N.
 
-    The same as :func:`folded_phasors` for motion that does not repeat: (w T)^2 times a sine is what its
-    targets bend from one SYNC to the next.
+    Times the share of :func:`bends_seen` it is the same as :func:`folded_phasors`, for motion that need
+    not repeat: (w T)^2 times a sine is what its targets bend from one SYNC to the next.
     """
-    period, reference = recording.sample_period, experiment.position_reference
-    folded = np.zeros(experiment.torque.shape)
+    reference = experiment.position_reference
+    course = np.zeros(experiment.torque.shape)
     if reference is None:
-        return folded
+        return course
+    for axis, information in enumerate(recording.axes):
+        controller = information.controller
+        known = information.name in lags(recording) and controller is not None
+        if controller is None or not known or np.any(np.isnan(reference[:, axis])):
+            continue
+        gain = controller.velocity_p * controller.position_p / 12
+        course[2:, axis] = -gain * np.diff(reference[:, axis], 2)
+    return course
+
+
+def bends_seen(recording: Recording) -> tuple[FloatArray, FloatArray]:
+    """Return the share of the bends that each axis' sampled torque shows, and its error, (M,) each.
+
+    A stair that velocity feed-forward makes counts as bends too: its value is that of its middle, and
+    is sampled (T - lag) after its begin, which a low-pass instead of a delay hardly changes.
+    """
+    period, found = recording.sample_period, np.zeros((2, len(recording.axes)))
     for axis, information in enumerate(recording.axes):
         lag, controller = lags(recording).get(information.name), information.controller
-        if lag is None or controller is None or np.any(np.isnan(reference[:, axis])):
+        if lag is None or controller is None:
             continue
-        gain = controller.velocity_p * controller.position_p * _lost(lag, period)
-        # a stair's value is that of its middle, and is sampled (T - lag) after its begin
-        late = shares(recording)[information.name] * (min(lag, period) / period - 0.5)
-        gain -= controller.velocity_p / period * late
-        folded[2:, axis] = -gain * np.diff(reference[:, axis], 2)
-    return folded
+        value, std = _seen(lag / period)
+        steps = 12 * shares(recording)[information.name] / (controller.position_p * period)
+        late = min(lag / period, 1.0) - 0.5
+        found[:, axis] = value - steps * late, np.hypot(std, steps * STAIR_UNSURE)
+    return found[0], found[1]
 
 
-def _lost(lag: float, period: float) -> float:
-    """Share of what a target bends by that a torque sampled so much later shows."""
-    place = min(lag / period, 1.0)
-    return (1 - 6 * place * (1 - place)) / 12
+def _seen(lag: float) -> tuple[float, float]:
+    """Share of the bends, and its error, for a lag in sample periods."""
+    place = min(lag, 1.0)
+    delay = 1 - 6 * place * (1 - place)
+    a = 2 * np.pi * lag
+    low_pass = 1 - 3 * a / (np.pi * np.tanh(np.pi / a)) + 3 * a**2 / np.pi**2 if a > 0 else 1.0
+    return float(delay + low_pass) / 2, max(LEAST_UNSURE, abs(low_pass - delay) / 2)
 
 
 def held_offset(

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from fieldtool.frf.held_targets import LINEAR_TARGETS, folded_course, folded_phasors
+from fieldtool.frf.held_targets import LINEAR_TARGETS, bends, bends_seen, folded_phasors
 from fieldtool.frf.multisine.matrix import joint_response
 from fieldtool.identify.likelihood.least_squares import standard_errors
 from fieldtool.identify.likelihood.parameters import (
@@ -17,7 +17,7 @@ from fieldtool.identify.likelihood.record_data import RecordData, Spectrum, spec
 from fieldtool.identify.likelihood.refine import RefinedModel, machine_response, refine
 from fieldtool.identify.multisine.dry_friction import signs_of_velocity
 from fieldtool.identify.multisine.whole_records import WholeRecords
-from fieldtool.records.closed_loop import AxisLoop, ClosedLoop
+from fieldtool.records.closed_loop import AxisLoop, Biquad, ClosedLoop
 from fieldtool.records.model import MachineModel
 from fieldtool.records.recorded import AxisInfo, Controller, Experiment, Recording
 
@@ -208,9 +208,51 @@ def test_folded_images_row_by_row_are_those_of_phasors(fresh_rng):
     )
     axes = (AxisInfo("x", "rotary", controller=Controller(10.0, 8.0, 5.0, 100.0)),)
     recording = Recording(STEP, axes, (one,), source={LINEAR_TARGETS: "x=0.0003"})
-    course = folded_course(recording, one)[500:, 0]
+    course = (bends(recording, one) * bends_seen(recording)[0])[500:, 0]
     wave = np.exp(-2j * np.pi * rate * time[500:])
     expected = folded_phasors(
         recording, np.array([rate]), np.array([[0.01 * np.exp(1j * phase)]], complex)
     )[0, 0]
     assert 2 * np.mean(course * wave) == pytest.approx(expected, rel=2e-3)
+
+
+def test_a_current_loops_lag_biases_no_mass(random_model, fresh_rng):
+    """Targets that bend at every SYNC, torques behind a low-pass: its share of the bends is fitted."""
+    model = random_model(fresh_rng, (2, 1))
+    period, settle, step = 1.0, 0.1, 0.002
+    rows = round((settle + 3 * period) / step)
+    lines = np.arange(1, 60, 2)
+    waves = np.exp(
+        2j * np.pi * np.outer((np.arange(rows) - round(settle / step)) * step, lines / period)
+    )
+    lag = Biquad.low_pass(500.0, 1.0)  # 0.64 ms at low frequencies
+    gains = [(12.0, axis.total_mass * 25.0, 10.0) for axis in model.axes]
+    loop = ClosedLoop(model, tuple(AxisLoop(*each, 0.0, filters=(lag,)) for each in gains))
+    experiments = []
+    for number in range(2):
+        phases = np.exp(2j * np.pi * fresh_rng.random((lines.size, 2)))
+        reference = np.real(waves @ (0.01 / np.maximum(lines, 3)[:, None] * phases))
+        position, torque = loop.simulate(reference, step)
+        sent = np.vstack([reference[1:], reference[-1:]])  # one SYNC before they are reached
+        experiments.append(
+            Experiment(
+                f"m{number}", "multisine", model.names, (), period, np.arange(rows) * step,
+                position + 1e-9 * fresh_rng.normal(size=position.shape),
+                torque + 1e-5 * fresh_rng.normal(size=torque.shape), position_reference=sent,
+            )
+        )  # fmt: skip
+    axes = tuple(
+        AxisInfo(axis.name, "rotary", controller=Controller(*each, 1e3))
+        for axis, each in zip(model.axes, gains, strict=True)
+    )
+    source = {LINEAR_TARGETS: " ".join(f"{name}=0.00064" for name in model.names)}
+    recording = Recording(step, axes, tuple(experiments), source=source)
+    records = WholeRecords(recording, joint_response(recording).lines, np.zeros(2))
+    data = records.data(as_found(model), run_in=True)
+    assert len(data.parts) == 2
+    wrong = []
+    for given in (data, replace(data, parts=())):
+        found = refine(model, given, fit_delay=True).model
+        pairs = zip(found.axes, model.axes, strict=True)
+        wrong.append(max(abs(a.total_mass / b.total_mass - 1.0) for a, b in pairs))
+    assert wrong[0] < 0.7 * wrong[1]

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fieldtool.frf.held_targets import LINEAR_TARGETS, folded_course, folded_phasors
+from fieldtool.frf.held_targets import LINEAR_TARGETS, bends, bends_seen, folded_phasors
 from fieldtool.records.recording import AxisInfo, Controller, Experiment, Recording
 
 PERIOD, LAG, FINE = 0.004, 0.0011, 400
@@ -40,7 +40,7 @@ def test_of_motion_that_does_not_repeat_it_is_the_same_to_first_order():
     zeros = np.zeros((rows, 1))
     time = PERIOD * np.arange(rows)
     experiment = Experiment("x", "moves", ("a",), (), None, time, zeros, zeros, sent[:, None])
-    course = folded_course(recording(1.0), experiment)[2:, 0]
+    course = (bends(recording(1.0), experiment) * bends_seen(recording(1.0))[0])[2:, 0]
     target = np.array([[1.0 + 0j]])
     frequency = np.array([omega / (2 * np.pi)])
     folded = folded_phasors(recording(1.0), frequency, target)[0, 0]

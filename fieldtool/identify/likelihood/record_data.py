@@ -66,14 +66,17 @@ def spectrum_of(
     return Spectrum(
         duration,
         2 * np.pi * bins / duration,
-        _integrals(position, step, bins) * (2 / duration),
-        _integrals(torque, step, bins) * (2 / duration),
+        amplitudes(position, step, bins),
+        amplitudes(torque, step, bins),
         torque[-1] - torque[0],
     )
 
 
-def _integrals(signals: FloatArray, step: float, bins: NDArray[np.intp]) -> ComplexArray:
-    """Integrals of x(t) exp(-j w t) over the stretch: of the straight line between the ends exactly."""
+def amplitudes(signals: FloatArray, step: float, bins: NDArray[np.intp]) -> ComplexArray:
+    """Integrals of x(t) exp(-j w t) over the stretch times 2 / L, (F, S), of signals (N + 1, S).
+
+    Of the straight line between the ends exactly.
+    """
     count = signals.shape[0] - 1
     change = signals[-1] - signals[0]
     rest = signals - signals[0] - np.linspace(0.0, 1.0, count + 1)[:, None] * change
@@ -82,8 +85,19 @@ def _integrals(signals: FloatArray, step: float, bins: NDArray[np.intp]) -> Comp
     rest[0] += rest[-1]
     sums = np.fft.rfft(rest[:-1], axis=0)[bins] * step
     omega = 2 * np.pi * bins / (count * step)
-    result: ComplexArray = sums - change / (1j * omega[:, None])
+    result: ComplexArray = (sums - change / (1j * omega[:, None])) * (2 / (count * step))
     return result
+
+
+@dataclass(frozen=True, eq=False)
+class TorquePart:
+    """Something in an axis' measured torque whose course is known, and its size all but known."""
+
+    axis: int
+    std: float
+    """Of what is not known of its size."""
+    spectra: tuple[ComplexArray, ...]
+    """(F,) of each stretch, N m or N a unit of size."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,6 +109,8 @@ class RecordData:
     spectra: tuple[Spectrum, ...]
     covariance: tuple[ComplexArray, ...]
     """Of each: (F, M, M), E[e e^H] of the equation error, rad2 or m2."""
+    parts: tuple[TorquePart, ...] = ()
+    """What is in the torques besides, its most likely size taken off already."""
 
     @cached_property
     def omega(self) -> FloatArray:
@@ -107,12 +123,16 @@ class RecordData:
         return sum(2 * int(one.position.size) for one in self.spectra)
 
     def eliminated(self, model: MachineModel) -> int:
-        """Return how many of the measured numbers the states at the ends use up."""
-        return 2 * int(model.mass_matrix.shape[0]) * len(self.spectra)
+        """Return how many of the numbers the states at the ends and sizes of torque parts use up."""
+        return 2 * int(model.mass_matrix.shape[0]) * len(self.spectra) + len(self.parts)
 
     def residuals(self, model: MachineModel, delays: FloatArray, _floor: float = 0.0) -> FloatArray:
-        """Equation errors in standard errors, the states eliminated."""
-        return np.concatenate([one.residuals for one in self.systems(model, delays)])
+        """Equation errors in standard errors, states and sizes of torque parts eliminated.
+
+        After those of all stretches comes one of each part: its size in standard errors.
+        """
+        rows = np.concatenate([one.residuals for one in self.systems(model, delays)])
+        return self._left(rows, model, delays)
 
     def jacobian(
         self,
@@ -122,7 +142,23 @@ class RecordData:
         _floor: float = 0.0,
     ) -> FloatArray:
         """Derivatives of :meth:`residuals` by the parameters, SI."""
-        return np.concatenate([one.jacobian(parameters) for one in self.systems(model, delays)])
+        rows = [one.jacobian(parameters) for one in self.systems(model, delays)]
+        return self._left(np.concatenate(rows), model, delays)
+
+    def _left(self, rows: FloatArray, model: MachineModel, delays: FloatArray) -> FloatArray:
+        """Rows (R,) or (R, P), those of the parts added, without what sizes of parts can explain."""
+        if not self.parts:
+            return rows
+        systems = self.systems(model, delays)
+        columns = [
+            np.concatenate([one.part(p.axis, p.spectra[k]) for k, one in enumerate(systems)])
+            for p in self.parts
+        ]
+        known = np.diag([1.0 / p.std for p in self.parts])
+        span = np.linalg.qr(np.vstack([np.stack(columns, axis=1), known]))[0]
+        wide = np.concatenate([rows, np.zeros((len(self.parts), *rows.shape[1:]))])
+        left: FloatArray = wide - span @ (span.T @ wide)
+        return left
 
     def systems(self, model: MachineModel, delays: FloatArray) -> "list[RecordSystem]":
         """Return each stretch at one machine; the last machine's are kept."""
@@ -207,6 +243,12 @@ class RecordSystem:
         """Derivatives of the residuals by the parameters, SI."""
         columns = np.stack([self._column(p) for p in parameters], axis=2)
         return self._left(_flat(self.whiten @ columns))
+
+    def part(self, axis: int, spectrum: ComplexArray) -> FloatArray:
+        """Derivative of the residuals by the size of what is in an axis' torque but does not act."""
+        turned = spectrum * np.exp(-self.s * self.delays[axis])
+        answer = self.moved[:, self._motors, axis] * turned[:, None]
+        return -self._left(_flat(_times(self.whiten, answer)))
 
     def _column(self, p: Parameter) -> ComplexArray:
         """Derivative of the motors' motion, (F, M): minus what is felt, through the compliance."""

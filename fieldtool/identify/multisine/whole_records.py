@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fieldtool.frf.held_targets import folded_course
+from fieldtool.frf.held_targets import bends, bends_seen
 from fieldtool.frf.multisine.lines import LinePhasors, same_level
 from fieldtool.frf.multisine.transient import windows
 from fieldtool.frf.phasors import equation_errors
@@ -20,6 +20,8 @@ from fieldtool.identify.likelihood.record_data import (
     RecordData,
     RecordSystem,
     Spectrum,
+    TorquePart,
+    amplitudes,
     spectrum_of,
 )
 from fieldtool.identify.likelihood.refine import RefinedModel, machine_response
@@ -90,27 +92,49 @@ class WholeRecords:
                 white = whitening(self._rough(self.lines[k], wide[k], found))
                 covariance[k] = noise.coloured(white, wide[k].omega)
         names = self.recording.names
-        return RecordData(names, tuple(wide), tuple(covariance[k] for k in range(len(wide))))
+        errors = tuple(covariance[k] for k in range(len(wide)))
+        return RecordData(names, tuple(wide), errors, self._parts(run_in))
 
     def _spectrum(self, one: LinePhasors, *, run_in: bool, beyond: bool) -> Spectrum:
         """Spectrum up to the highest line, or as far beyond it as the noise is wanted."""
-        experiment, step, rows = one.given.experiment, self.recording.sample_period, one.given.rows
-        torque = experiment.torque - folded_course(self.recording, experiment)
+        experiment, step = one.given.experiment, self.recording.sample_period
+        torque = experiment.torque - self._bends(one) * bends_seen(self.recording)[0]
         if np.any(self.friction):
             signs = signs_of_velocity(experiment, step, float(one.frequencies[-1]))
             torque = torque - signs * self.friction
-        last = one.given.lines[-1]
-        first = 0 if run_in else rows.start - 1
-        signals = np.hstack([experiment.position, torque])[max(first, 0) : rows.stop]
-        if first < 0 or (run_in and rows.start == 0):
-            signals = _with_next(signals, one.given.samples)
-        duration = (signals.shape[0] - 1) * step
-        period = one.given.samples * step
-        highest = last + max(10, last // 3) if beyond else last
-        top = min(int(highest * duration / period + 1e-6), signals.shape[0] // 2 - 1)
-        low = 1 if beyond else max(1, int(SLOWEST * one.given.lines[0] * duration / period))
-        bins, M = np.arange(low, top + 1), len(self.recording.axes)
+        M = len(self.recording.axes)
+        signals, bins = self._cut(one, np.hstack([experiment.position, torque]), run_in, beyond)
         return spectrum_of(signals[:, :M], signals[:, M:], step, bins)
+
+    def _bends(self, one: LinePhasors) -> FloatArray:
+        return bends(self.recording, one.given.experiment)
+
+    def _parts(self, run_in: bool) -> tuple[TorquePart, ...]:
+        """The shares of the bends that torques show, of the axes that have any."""
+        unsure = bends_seen(self.recording)[1]
+        courses = [self._cut(one, self._bends(one), run_in, beyond=False) for one in self.lines]
+        spectra = [amplitudes(rows, self.recording.sample_period, bins) for rows, bins in courses]
+        return tuple(
+            TorquePart(axis, float(std), tuple(each[:, axis] for each in spectra))
+            for axis, std in enumerate(unsure)
+            if std > 0.0 and any(np.any(each[:, axis]) for each in spectra)
+        )
+
+    def _cut(
+        self, one: LinePhasors, signals: FloatArray, run_in: bool, beyond: bool
+    ) -> tuple[FloatArray, NDArray[np.intp]]:
+        """Rows of a stretch, both ends among them, and the bins in question."""
+        rows, period = one.given.rows, one.given.samples
+        first = 0 if run_in else max(rows.start - 1, 0)
+        cut = signals[first : rows.stop]
+        if rows.start == 0:
+            cut = _with_next(cut, period)
+        count = cut.shape[0] - 1
+        last = one.given.lines[-1]
+        highest = last + max(10, last // 3) if beyond else last
+        lowest = 0.0 if beyond else SLOWEST * float(one.given.lines[0])
+        top = min(int(highest * count / period + 1e-6), count // 2 - 1)
+        return cut, np.arange(max(1, int(lowest * count / period)), top + 1)
 
     def _rough(self, one: LinePhasors, at: Spectrum, found: RefinedModel) -> ComplexArray:
         """Covariance of the equation error as the phasors' noise says."""
