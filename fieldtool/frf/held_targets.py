@@ -134,7 +134,7 @@ def bends_seen(recording: Recording) -> tuple[FloatArray, FloatArray]:
     period, found = recording.sample_period, np.zeros((2, len(recording.axes)))
     for axis, information in enumerate(recording.axes):
         lag, controller = lags(recording).get(information.name), information.controller
-        if lag is None or controller is None:
+        if lag is None or controller is None or controller.position_p == 0.0:
             continue
         value, std = _seen(lag / period)
         steps = 12 * shares(recording)[information.name] / (controller.position_p * period)
