@@ -29,7 +29,7 @@ from drives.errors import (
     WrongDeviceError,
 )
 from drives.objects import ObjectAddress, ObjectInfo
-from drives.profile import AxisProfile, DriveProfile
+from drives.profile import AxisProfile, DriveProfile, Identity
 from drives.profile.eds import info_at, read_eds, variables, writable
 from drives.profile.match import offered_modes
 from drives.units import AxisScaling
@@ -268,6 +268,7 @@ class CanopenDrive:
             ("vendor-ID 0x1018:01", wanted.vendor_id, found.vendor_id, 0xFFFFFFFF),
             ("product code 0x1018:02", wanted.product_code, found.product_code, 0xFFFFFFFF),
             ("serial number 0x1018:04", self._axis.serial_number, found.serial_number, 0xFFFFFFFF),
+            ("supported modes 0x6502", wanted.supported_modes, self._modes(wanted), 0xFFFFFFFF),
         ):
             if expected is not None and expected & bits != held & bits:
                 raise WrongDeviceError(
@@ -276,6 +277,12 @@ class CanopenDrive:
                     f"0x{expected:08X}. Check the node id and the machine profile."
                 )
         return self._identity
+
+    def _modes(self, wanted: Identity) -> int:
+        """Return 0x6502 where the profile tells such drives by it."""
+        if wanted.supported_modes is None:
+            return 0
+        return self.read_optional(objects.SUPPORTED_MODES) or 0
 
     def _first_answer(self) -> int:
         try:

@@ -5,6 +5,7 @@ on the packaged turntable with an arm, its two drives being of the kinds named. 
 profile with the facts filled in that it says are unknown.
 """
 
+import os
 import sys
 import tempfile
 import time
@@ -23,6 +24,7 @@ GAINS = ("position_p", "velocity_p", "velocity_i")
 
 def main() -> None:
     """Print the table."""
+    os.environ["FIELDTOOL_STATE_DIR"] = tempfile.mkdtemp()  # notes of other sessions are not ours
     print(
         f"{'table':18}{'arm':18}{'worst to reference':>20}{'worst to truth':>16}{'gains':>12}{'s':>6}"
     )
@@ -47,7 +49,8 @@ def main() -> None:
         gains = f"{worst_gain:.1e}" if pair in WRITTEN else "not written"
         seconds = time.perf_counter() - begin
         print(
-            f"{drives[0]:18}{drives[1]:18}{to_reference:20.1e}{to_truth:16.1e}{gains:>12}{seconds:6.0f}"
+            f"{drives[0]:18}{drives[1]:18}{to_reference:20.1e}{to_truth:16.1e}{gains:>12}{seconds:6.0f}",
+            flush=True,
         )
 
 

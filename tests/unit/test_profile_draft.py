@@ -13,6 +13,7 @@ from drives.profile import load_drive, load_machine, packaged
 from drives.profile.draft import draft, profile_name
 from drives.profile.eds import MAX_EDS_BYTES, read_eds
 from drives.profile.schema import json_schema
+from fieldtool.cli.main import main
 from fieldtool.errors import OutputError
 from fieldtool.workflow.profiling import check_profile, new_profile
 
@@ -239,3 +240,50 @@ def test_spoilt_drive_profiles_are_read_or_refused_never_anything_else(tmp_path,
         assert isinstance(profile.unknown, tuple)
         assert isinstance(profile.tunable, frozenset)
     assert "\n" not in said
+
+
+# --- the commands --------------------------------------------------------------------------------
+
+
+def command(capsys, *arguments: str) -> tuple[int, str, str]:
+    with pytest.raises(SystemExit) as ended:
+        main(arguments)
+    out, err = capsys.readouterr()
+    return ended.value.code or 0, out, err
+
+
+def test_the_command_makes_a_profile_once(tmp_path, capsys):
+    eds = tmp_path / "my-drive.eds"
+    eds.write_bytes((FOLDER / "epos4.eds").read_bytes())
+    code, out, _ = command(capsys, "profile", "new", "--eds", str(eds), "--json")
+    made = json.loads(out)
+    assert code == 0
+    assert made["name"] == load_drive(tmp_path / "my-drive.yaml").name == "my-drive"
+    assert load_drive(tmp_path / "my-drive.yaml").eds == "my-drive.eds"
+    assert "torque.scale" in made["unknown"]
+    code, _, err = command(capsys, "profile", "new", "--eds", str(eds))
+    assert code == 3
+    assert "is there already and is not overwritten" in err
+
+
+def test_the_command_tells_file_and_line(tmp_path, capsys):
+    path = tmp_path / "mine.yaml"
+    path.write_text(
+        "format: fieldtool-drive/1\nname: mine\neds: own\nidentity: {}\ntorqe: unknown\n"
+    )
+    code, _, err = command(capsys, "profile", "check", str(path))
+    assert code == 2
+    assert err == (
+        f"fieldtool: {path}:5: torqe is not a known key. Check its spelling or take it out.\n"
+    )
+    code, _, err = command(capsys, "profile", "new", "--eds", str(path))
+    assert code == 2
+    assert "is no EDS" in err
+
+
+def test_the_command_prints_schemas(capsys):
+    for kind in ("drive", "machine"):
+        code, out, _ = command(capsys, "profile", "schema", kind)
+        assert code == 0
+        assert json.loads(out)["title"] == f"fieldtool {kind} profile"
+    assert command(capsys, "profile", "schema", "robot")[0] == 2
