@@ -58,6 +58,8 @@ class Channel:
     allowed: int = 0
     """Largest change of position units since then."""
     missing: int = 0
+    paused: float = 0.0
+    """Cycles by which SYNC was late since the last sample: the axis had more time to move."""
     heard: float = 0.0
     emergencies: list[int] = field(default_factory=list)
     nmt_state: int = NMT_OPERATIONAL
@@ -74,7 +76,7 @@ class Channel:
     span_units: int = 0
     """Largest change of position units over that span."""
     span_begin: int | None = None
-    span_count: int = 0
+    span_count: float = 0.0
     too_fast: bool = False
     takes_offset: bool = False
     """Whether the torque in its PDO is the torque offset 0x60B2."""
@@ -105,18 +107,19 @@ class Channel:
         self.still += 1
         if self.position != self.previous:
             self.anchor, self.still = None, 0
-        self.allowed = self.step * (1 + self.missing)
-        self._judge_span(1 + self.missing)
-        self.missing = 0
+        cycles = 1 + self.missing + self.paused
+        self.allowed = ceil(self.step * cycles)
+        self._judge_span(cycles)
+        self.missing, self.paused = 0, 0.0
 
-    def _judge_span(self, cycles: int) -> None:
+    def _judge_span(self, cycles: float) -> None:
         if self.span_begin is None:
             self.span_begin = self.position
         self.span_count += cycles
         if self.span_count >= self.span:
             share = self.span_count / self.span
             self.too_fast = abs(self.position - self.span_begin) > self.span_units * share
-            self.span_begin, self.span_count = self.position, 0
+            self.span_begin, self.span_count = self.position, 0.0
 
     def is_stuck(self, target: int) -> bool:
         """Whether the position stands while the target moves."""

@@ -16,7 +16,7 @@ from drives.canopen_drive.drive import CanopenDrive
 from drives.canopen_drive.interrupts import uninterrupted
 from drives.canopen_drive.line import Line
 from drives.canopen_drive.outputs import Outputs, outputs_of
-from drives.canopen_drive.pace import Punctuality
+from drives.canopen_drive.pace import LATE_SHARE, Punctuality
 from drives.canopen_drive.setup import HOST_HEARTBEAT, HOST_LOST_AFTER
 from drives.canopen_drive.sync import HostSync, Sync
 from drives.cia402 import ENABLED_VALUE, STEP_TOWARDS_ENABLED, Controlword, PowerState
@@ -67,6 +67,7 @@ class CanopenMotion:
         self._by_node = {c.drive.node_id: c for c in self._channels}
         self._sync: Sync = sync or HostSync(line, cycle_time)
         self._disturbed = False
+        self._moment = line.clock.now()
         self._lost = line.overruns
         self._lost_before = self._lost
         self._count = 0
@@ -389,9 +390,18 @@ class CanopenMotion:
         self._disturbed = False
         moment = self._sync.give(self._early)
         self._count += 1
+        self._note_pause(moment)
         complete = self._collect(moment + REPLY_SHARE * self._cycle_time)
         spoiled = self._disturbed or self._sync.lateness > 0 or self._lost_frames()
         return complete and not spoiled
+
+    def _note_pause(self, moment: float) -> None:
+        """Have velocities judged over the time that has passed, where a SYNC was late."""
+        paused = (moment - self._moment) / self._cycle_time - 1
+        self._moment = moment
+        if paused > LATE_SHARE:
+            for channel in self._channels:
+                channel.paused += paused
 
     def _lost_frames(self) -> bool:
         """Whether received frames were lost since this was asked last."""
