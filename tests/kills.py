@@ -19,7 +19,7 @@ STORE_INDEX = 0x1010
 BEFORE = 65
 """Frames that the host sends to each drive before it writes, about."""
 Supply = Literal["stays", "of one drive fails", "of all drives fails"]
-Kind = Literal["before the first write", "after a frame", "while storing"]
+Kind = Literal["before the first write", "after a frame", "while storing", "at the end"]
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Blow:
     frames: int
     """Frames of the host: from the start, or from the first object that is written."""
     seconds: float
-    """From the first drive's storing, for ``while storing``."""
+    """From the first drive's storing, for ``while storing``; from the last frame, ``at the end``."""
     supply: Supply
     which: int
     """Number of the drive whose supply fails."""
@@ -85,15 +85,23 @@ def _value(rng: np.random.Generator, name: str) -> float:
 
 
 def _blow(rng: np.random.Generator, axes: int, store_time: float, store: bool) -> Blow:
-    kinds: tuple[Kind, ...] = ("before the first write", "after a frame", "while storing")
-    kind = kinds[rng.choice(3, p=(0.1, 0.5, 0.4) if store else (0.15, 0.85, 0.0))]
-    last = (3 * len(WRITABLE) + 1 if store else 2 * len(WRITABLE)) * axes
+    kinds: tuple[Kind, ...] = (
+        "before the first write",
+        "after a frame",
+        "while storing",
+        "at the end",
+    )
+    kind = kinds[rng.choice(4, p=(0.1, 0.45, 0.3, 0.15) if store else (0.1, 0.75, 0.0, 0.15))]
+    last = (4 * len(WRITABLE) + 1 if store else 2 * len(WRITABLE)) * axes
+    frames = {"before the first write": int(rng.integers(1, BEFORE * axes)), "at the end": last}
+    longest = 0.05 if kind == "at the end" else 1.1 * axes * store_time
     supplies: tuple[Supply, ...] = ("stays", "of one drive fails", "of all drives fails")
+    ended = kind == "at the end" and not store  # what was not stored may be gone then, as was said
     return Blow(
         kind,
-        int(rng.integers(1, BEFORE * axes if kind == "before the first write" else last)),
-        float(rng.uniform(0.0, 1.1 * axes * store_time)),
-        supplies[rng.choice(3, p=(0.5, 0.25, 0.25))],
+        frames.get(kind, int(rng.integers(1, last))),
+        float(rng.uniform(0.0, longest)),
+        supplies[0 if ended else rng.choice(3, p=(0.5, 0.25, 0.25))],
         int(rng.integers(axes)),
         tuple(str(b) for b in rng.choice(("old", "new", "corrupted"), axes)),
     )
@@ -106,7 +114,8 @@ class _Killer:
         self._machine, self._blow = machine, blow
         self._tool: ToolProcess | None = None
         self._frames = 0
-        self._writing, self._due = False, None
+        self._writing = False
+        self._due: int | None = None
         self._store_began: int | None = None
 
     def aim(self, start: Callable[[], ToolProcess]) -> Ended:
@@ -125,19 +134,17 @@ class _Killer:
             self._writing = True
             if object_of(message) == STORE_INDEX and self._store_began is None:
                 self._store_began = self._machine.machine.time
-        if self._blow.kind == "before the first write" or (
-            self._blow.kind == "after a frame" and self._writing
-        ):
+        if self._blow.kind == "before the first write" or self._writing:
             self._frames += 1
-            if self._frames == self._blow.frames:
+            if self._frames == self._blow.frames and self._blow.kind == "at the end":
+                self._due = self._machine.machine.time
+            elif self._frames == self._blow.frames and self._blow.kind != "while storing":
                 self._strike()
 
     def _look(self) -> None:
-        began = self._store_began
-        if self._blow.kind == "while storing" and began is not None:
-            passed = (self._machine.machine.time - began) / 1e9
-            if passed >= self._blow.seconds:
-                self._strike()
+        due = self._store_began if self._blow.kind == "while storing" else self._due
+        if due is not None and (self._machine.machine.time - due) / 1e9 >= self._blow.seconds:
+            self._strike()
 
     def _strike(self) -> None:
         tool, blow = self._tool, self._blow
