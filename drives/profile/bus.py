@@ -17,7 +17,7 @@ class BusProfile(Part):
         default_factory=dict
     )
     """What else the adapter's python-can interface takes, by name; others are refused."""
-    shortest_cycle: Annotated[Seconds, Field(ge=0.001, le=0.1)] = 0.001
+    shortest_cycle: Annotated[Seconds, Field(ge=0.001, le=0.01)] = 0.001
     """The tool uses no cycle shorter than this, however short one would fit the bit rate: for a
     computer or an adapter that can not keep up."""
     sync: Literal["host", "kernel"] = "host"
