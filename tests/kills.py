@@ -201,10 +201,18 @@ def tried(machine: MachineApart, moment: Moment, name: str) -> Trial:
     whole = when == "before the backup" or _is_whole(backup, old)
     if not whole:
         faults.append("the backup is lost")
-    left = [p.name for p in (machine.folder / "notes").glob("*.yaml")]
-    if left:
-        faults.append(f"notes are left: {left}")
+    if _notes(machine) and when == "ended":  # killed before they were removed: the next one does it
+        other = machine.session(f"{name}-next", moment.new)
+        following = machine.run("write", other, "--yes")
+        if following.code != 0:
+            faults.append(f"the next session ended with {following.code}: {following.text.strip()}")
+    if _notes(machine):
+        faults.append(f"notes are left: {_notes(machine)}")
     return Trial(when, moment.blow.supply, killed_again, held[0], held[1], whole, "; ".join(faults))
+
+
+def _notes(machine: MachineApart) -> list[str]:
+    return [path.name for path in (machine.folder / "notes").glob("*.yaml")]
 
 
 def _how_far(session: Path, ended: Ended, faults: list[str]) -> str:
