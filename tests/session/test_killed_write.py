@@ -1,11 +1,14 @@
 """A few random moments of kill -9, with real processes; ``bench_kill.py`` tries 200 of them."""
 
+import signal
+
 import numpy as np
 import pytest
 
 from tests.apart import MachineApart
 from tests.kills import random_moment, tried
 
+pytestmark = pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="no SIGKILL on Windows")
 AXES, MOMENTS = 2, 5
 STORE_TIME = 0.2
 
