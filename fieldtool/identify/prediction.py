@@ -86,6 +86,7 @@ def predict_load(
     extra: str = "load_position",
     band: tuple[float, float] = (11.0, 200.0),
     load_friction: float = 0.0,
+    ground_spring: float = 0.0,
 ) -> tuple[LoadPrediction, ...]:
     """Compare the load side that ``model`` predicts with the one that was measured.
 
@@ -106,6 +107,8 @@ def predict_load(
     load_friction
         Viscous friction between the axis's last mass and ground, N m s/rad or N s/m; the friction
         at the motor is in the model.
+    ground_spring
+        Between the axis' motor and ground, N m/rad or N/m (see ``surroundings``).
 
     Returns
     -------
@@ -132,7 +135,8 @@ def predict_load(
             "is nothing to check the prediction against."
         )
     return tuple(
-        _compare(model, delay, recording, e, name, signal, band, load_friction) for e in fitting
+        _compare(model, delay, recording, e, name, signal, band, (load_friction, ground_spring))
+        for e in fitting
     )
 
 
@@ -142,18 +146,21 @@ def load_responses(
     delay: float,
     frequencies: Sequence[float] | FloatArray,
     load_friction: float = 0.0,
+    ground_spring: float = 0.0,
 ) -> tuple[ComplexArray, ComplexArray]:
     """Return load position per motor position and load position per torque, (L,) each.
 
     From the equation of motion (-w^2 M + j w C + K) q = tau with torque on this axis's motor only,
     all other axes free.  ``frequencies`` in Hz, ``delay`` in s,
-    ``load_friction`` between the last mass and ground in N m s/rad or N s/m.
+    ``load_friction`` between the last mass and ground in N m s/rad or N s/m, ``ground_spring``
+    between the motor and ground in N m/rad or N/m.
     """
     place = model.names.index(axis)
     first, last = int(model.first_masses[place]), int(model.last_masses[place])
     w = 2 * np.pi * np.asarray(frequencies, dtype=np.float64)
     M, C, K = model.mass_matrix, model.damping_matrix, model.stiffness_matrix
     C[last, last] += load_friction
+    K[first, first] += ground_spring
     dynamic = -(w**2)[:, None, None] * M + 1j * w[:, None, None] * C + K
     push = np.zeros((M.shape[0], 1))
     push[first] = 1.0
@@ -169,7 +176,7 @@ def _compare(
     name: str,
     signal: str,
     band: tuple[float, float],
-    load_friction: float,
+    ground: tuple[float, float],
 ) -> LoadPrediction:
     result = analyse_multisine(recording, experiment)
     axis = recording.names.index(name)
@@ -189,7 +196,7 @@ def _compare(
     frequencies = frequencies[inside]
     lines = np.rint(frequencies * average.period).astype(np.intp) - 1
     load = average.mean[lines, 0]
-    per_position, per_torque = load_responses(model, name, delay, frequencies, load_friction)
+    per_position, per_torque = load_responses(model, name, delay, frequencies, *ground)
     return LoadPrediction(
         experiment=experiment.name,
         axis=name,

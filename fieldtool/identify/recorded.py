@@ -12,7 +12,7 @@ from fieldtool.identify.chain import ChainResult, identify_chain
 from fieldtool.identify.classic import identify_classic
 from fieldtool.identify.likelihood.refine import RefinedModel
 from fieldtool.identify.moves.identify import identify_moves
-from fieldtool.identify.multisine.identify import identify_joint
+from fieldtool.identify.multisine.identify import effect_entry, identify_joint
 from fieldtool.records.model import Estimate, FloatArray, Kind, MachineModel
 from fieldtool.records.recording import Recording
 
@@ -138,7 +138,7 @@ def _chain(recording: Recording, known: Mapping[str, int]) -> Identified:
     _check_known(recording, known)
     chain = identify_chain(recording, known[recording.names[0]])
     return Identified(
-        _with_delay(chain),
+        _with_effects(chain, recording.axes[0].torque_unit),
         "multisine, maximum likelihood fit of masses, springs, dampers, delay and friction",
         {chain.response.condition: chain.response},
         np.array([ratio.value for ratio in chain.features.damping_ratios]),
@@ -184,10 +184,13 @@ def _moves(
     )
 
 
-def _with_delay(chain: ChainResult) -> MachineModel:
-    effect = {
-        "effect": "measurement_delay",
-        "axis": chain.model.axes[0].name,
-        "parameters": {"delay": {"value": chain.delay.value, "std": chain.delay.std, "unit": "s"}},
-    }
-    return replace(chain.model, effects=(*chain.model.effects, effect))
+def _with_effects(chain: ChainResult, torque_unit: str) -> MachineModel:
+    """Put the delay, and a spring to ground where there is one, among the model's effects."""
+    axis = chain.model.axes[0].name
+    effects = [effect_entry("measurement_delay", axis, "delay", chain.delay, "s")]
+    if chain.beside.spring is not None:
+        unit = f"{torque_unit}/{'rad' if chain.model.axes[0].kind == 'rotary' else 'm'}"
+        effects.append(
+            effect_entry("coulomb_friction", axis, "stiffness", chain.beside.spring, unit)
+        )
+    return replace(chain.model, effects=(*chain.model.effects, *effects))

@@ -63,13 +63,20 @@ def compare(
             f"{', '.join(data.names)}."
         )
     machine = read_model(model) if model else identify_recording(data, {}).model
-    return predict_load(machine, _delay_of(machine), data, band=band)
+    return predict_load(
+        machine,
+        _known(machine, "measurement_delay", "delay"),
+        data,
+        band=band,
+        ground_spring=_known(machine, "coulomb_friction", "stiffness"),
+    )
 
 
-def _delay_of(model: MachineModel) -> float:
-    for effect in model.effects:
-        if effect.get("effect") == "measurement_delay":
-            return float(effect["parameters"]["delay"]["value"])
+def _known(model: MachineModel, effect: str, parameter: str) -> float:
+    """Return a parameter of an effect of the model's only axis; 0 if it is not there."""
+    for one in model.effects:
+        if one.get("effect") == effect and parameter in one["parameters"]:
+            return float(one["parameters"][parameter]["value"])
     return 0.0
 
 

@@ -499,15 +499,18 @@ def _with_effects(
     effects = list(fitted.model.effects)
     for axis, delay in zip(fitted.model.axes, fitted.delays, strict=True):
         if abs(delay.value) > max(DELAY_SEEN * delay.std, DELAY_SHARE * recording.sample_period):
-            effects.append(_effect("measurement_delay", axis.name, "delay", delay, "s"))
+            effects.append(effect_entry("measurement_delay", axis.name, "delay", delay, "s"))
     for k in friction.seen(SEEN):
         unit = recording.axes[k].torque_unit
         effects.append(
-            _effect("coulomb_friction", friction.axes[k], "torque", friction.torque[k], unit)
+            effect_entry("coulomb_friction", friction.axes[k], "torque", friction.torque[k], unit)
         )
     return replace(fitted.model, effects=tuple(effects))
 
 
-def _effect(name: str, axis: str, parameter: str, value: Estimate, unit: str) -> dict[str, object]:
+def effect_entry(
+    name: str, axis: str, parameter: str, value: Estimate, unit: str
+) -> dict[str, object]:
+    """Return an effect with one parameter, as a model holds it."""
     values = {"value": value.value, "std": value.std, "unit": unit}
     return {"effect": name, "axis": axis, "parameters": {parameter: values}}
