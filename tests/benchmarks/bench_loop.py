@@ -6,7 +6,7 @@ takes more than half of the cycle.  On a SocketCAN bus (``vcan0`` here, or in a 
 has none) master and simulated drives are two processes in real time: late cycles, worst lateness,
 spoiled rows, what a third listener's kernel time stamps say of the SYNC, the host's processor share,
 and the bus load by the bit rate.  A guest has one slow processor for both; its figures say what is
-seen and survived, not what a laptop can do.
+seen and survived, not what a laptop can do, and its processor shares are counted in whole clock ticks.
 """
 
 import argparse
