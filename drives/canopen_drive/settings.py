@@ -64,7 +64,6 @@ def read_settings(drive: CanopenDrive) -> DriveSettings:
     torques = tuple(drive.read_int(objects.TORQUE_ACTUAL) * scale.torque for _ in range(SAMPLES))
     in_position_units = drive.profile.velocity == "position units/s"
     maximum = _optional(drive, objects.MAX_TORQUE)
-    window = _optional(drive, objects.FOLLOWING_ERROR_WINDOW)
     return DriveSettings(
         position=drive.read_position(),
         torque=torques,
@@ -79,12 +78,21 @@ def read_settings(drive: CanopenDrive) -> DriveSettings:
             scale.position if in_position_units else None,
         ),
         max_torque=_scaled(maximum, scale.torque),
-        following_error=None if window == 0xFFFFFFFF else _scaled(window, scale.position),
+        following_error=following_error_window(drive),
         consumer_heartbeat=drive.read_optional(objects.CONSUMER_HEARTBEAT),
         abort_connection=drive.read_optional(objects.ABORT_CONNECTION),
         error_behaviour=drive.read_optional(objects.ERROR_BEHAVIOUR),
         quick_stop=drive.read_optional(objects.QUICK_STOP_OPTION),
     )
+
+
+def following_error_window(drive: CanopenDrive) -> float | None:
+    """Return the drive's own window 0x6065, rad or m; None where it has none, or it is off.
+
+    Beyond it a drive stops by itself, with an emergency.
+    """
+    window = _optional(drive, objects.FOLLOWING_ERROR_WINDOW)
+    return None if window == 0xFFFFFFFF else _scaled(window, drive.scaling.position)
 
 
 def _optional(drive: CanopenDrive, info: ObjectInfo) -> int | None:

@@ -31,7 +31,7 @@ from fieldtool.workflow.planning import (
     timing,
     usual_seconds,
 )
-from fieldtool.workflow.preparation import axes_of, recording_header, setting_of
+from fieldtool.workflow.preparation import axes_of, recording_header, setting_of, window_notes
 from fieldtool.workflow.session import Options, Screen, Session
 from fieldtool.workflow.stopped import check_loops, judge_stop
 from fieldtool.writeback.temporary import backed_up
@@ -75,8 +75,9 @@ def plan(
         cycle_time = fast_cycle_times(setting.model, group.shortest_cycle)[0]
         times = timing(setting, options.excitation_time or usual_seconds(setting.model))
         planned, _ = planned_before(group, setting, cycle_time, times)
+        notes = window_notes(group, setting)
     if screen is not None:
-        for note in _longer_than_asked(planned, options.excitation_time):
+        for note in (*_longer_than_asked(planned, options.excitation_time), *notes):
             screen.say(note)
         screen.fast_plan(planned)
     return planned
@@ -192,6 +193,8 @@ class _Measurement:
         screen.stage("Plan pilot and main experiments with the machine as last accepted")
         planned, pilot = planned_before(self._group, self._setting, cycle_time, self._times)
         for note in _longer_than_asked(planned, self._asked):
+            self._session.warn(note)
+        for note in window_notes(self._group, self._setting):
             self._session.warn(note)
         screen.fast_plan(planned)
         return pilot

@@ -21,7 +21,7 @@ from fieldtool.identify.classic import without_friction
 from fieldtool.identify.recorded import identify_recording
 from fieldtool.records.recording import Experiment, Recording, RecordingWriter
 from fieldtool.workflow.models import prior_model
-from fieldtool.workflow.preparation import axes_of, recording_header, setting_of
+from fieldtool.workflow.preparation import axes_of, recording_header, setting_of, window_notes
 from fieldtool.workflow.session import Session
 from fieldtool.writeback.temporary import backed_up
 
@@ -46,7 +46,7 @@ def _measure_both_passes(session: Session, group: CanopenGroup) -> float:
     expected = forecast(plan, setting)
     guess = SETTLE_PERIODS / lowest_mode(setting.model)
     screen.plan(plan, expected, plan.expected_duration(guess))
-    for note in plan.notes:
+    for note in (*plan.notes, *window_notes(group, setting)):
         screen.say(note)
     if not session.ready():
         raise UserStopError("not begun: nothing was moved")

@@ -1,26 +1,57 @@
 """What every measurement begins with: what planning has to know, and the recording's heading."""
 
+from dataclasses import replace
+
 import numpy as np
 
+from drives.api import AxisLimits
 from drives.canopen_drive import CanopenDrive, CanopenGroup
+from drives.canopen_drive.settings import following_error_window
 from drives.parameters import read_loop
 from drives.profile import MachineProfile
 from fieldtool.experiment.axes import Axes
 from fieldtool.experiment.forecast import Setting
 from fieldtool.experiment.multisine.unit_inputs import smooth
 from fieldtool.frf.held_targets import LINEAR_TARGETS
-from fieldtool.records.closed_loop import loop_from_parameters
+from fieldtool.records.closed_loop import AxisLoop, loop_from_parameters
 from fieldtool.records.model import MachineModel
 from fieldtool.records.recording import AxisInfo, Controller, Recording
 
 
 def setting_of(machine: MachineProfile, group: CanopenGroup, model: MachineModel) -> Setting:
-    """Return model, loops as they are in the drives now, limits, and centres."""
+    """Return model, loops as they are in the drives now, limits, and centres.
+
+    Where a drive's own following error window is tighter than the profile's, it is the limit.
+    """
+    loops = tuple(loop_from_parameters(read_loop(drive)) for drive in group.drives)
     return Setting(
         model,
-        tuple(loop_from_parameters(read_loop(drive)) for drive in group.drives),
-        tuple(drive.limits for drive in group.drives),
+        loops,
+        tuple(_within_window(*pair) for pair in zip(group.drives, loops, strict=True)),
         np.array([sum(axis.limits.travel) / 2 for axis in machine.axes]),
+    )
+
+
+def _within_window(drive: CanopenDrive, loop: AxisLoop) -> AxisLimits:
+    """Limits of an axis within the drive's own window, feed-forward off: the error grows with speed."""
+    limits, window = drive.limits, following_error_window(drive)
+    if window is None or window >= limits.following_error:
+        return limits
+    velocity = (
+        min(limits.velocity, window * loop.position_p) if loop.position_p else limits.velocity
+    )
+    return replace(limits, following_error=window, velocity=velocity)
+
+
+def window_notes(group: CanopenGroup, setting: Setting) -> tuple[str, ...]:
+    """Say which drives' own windows are tighter than the profile's limits."""
+    return tuple(
+        f"{drive.axis}: the drive's own following error window (0x6065) is {own.following_error:.4g} "
+        f"{drive.position_unit}, the profile allows {drive.limits.following_error:.4g} "
+        f"{drive.position_unit}. The plan keeps within the drive's, at {own.velocity:.3g} "
+        f"{drive.position_unit}/s or less; a wider window, if the machine allows one, tells more."
+        for drive, own in zip(group.drives, setting.limits, strict=True)
+        if own.following_error < drive.limits.following_error
     )
 
 
