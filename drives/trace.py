@@ -29,6 +29,7 @@ LOOKED_AT_EVERY = 4096
 SAME_CLOCK = 60.0
 """Seconds by which an adapter's time stamps may differ from this computer's clock; stamps that are
 farther off count from some other start, and are moved to this computer's clock."""
+SYNC_ID = 0x080
 _BLF_CONTAINER = 8192
 """Bytes that a BLF file holds back at most: its compressed containers are written when full."""
 
@@ -155,6 +156,8 @@ class TracedBus:
                 away = self._now() - message.timestamp
                 self._shift = 0.0 if abs(away) < SAME_CLOCK else away
             message.timestamp += self._shift
+            # a local process' frame looks sent to the kernel; only a SYNC of it can be the host's own
+            message.is_rx = message.is_rx or message.arbitration_id != SYNC_ID
             self.trace.note(message)
         return message
 

@@ -121,7 +121,8 @@ class MoveChecks:
     def _ended(self, error: Exception, axis: str) -> None:
         text = str(error).removeprefix(f"{axis}: ") if axis else str(error)
         notes = " ".join(getattr(error, "__notes__", ()))
-        self._findings.note("direction", "fail", f"{text} {notes}".strip(), axis)
+        check = "direction" if axis else "moves"
+        self._findings.note(check, "fail", f"{text} {notes}".strip(), axis)
         for other in self._machine.axes:
             if other.name != axis:
                 why = "the moves ended before"
@@ -130,12 +131,10 @@ class MoveChecks:
     def _pace(self, group: CanopenGroup, bus: Bus) -> None:
         if not isinstance(clock_of(bus), WallClock):
             return
-        late = group.late_cycles
+        punctual = group.punctuality
         self._findings.note(
             "cycle time",
-            "warn" if late else "pass",
-            f"{late} cycles began late while the axes moved",
-            todo="Close other programs; blocks with late cycles are measured again."
-            if late
-            else "",
+            "warn" if punctual.late or punctual.overruns else "pass",
+            f"while the axes moved: {punctual.sentence}",
+            todo=punctual.advice,
         )

@@ -1,9 +1,12 @@
 """A session done again by the tool itself, with its trace in place of drives."""
 
 import json
+import os
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -16,6 +19,7 @@ from fieldtool.records.session_folder import SessionFolder
 from fieldtool.workflow.replaying import Source
 from fieldtool.workflow.session import Options, Screen
 from fieldtool.workflow.stages import measure, run
+from fieldtool.writeback.unfinished import STATE_VARIABLE
 
 
 @dataclass(frozen=True)
@@ -49,11 +53,12 @@ def again(source: Source, out: Path, screen: Screen | None = None) -> Again:
     played = machine.model_copy(update={"bus": bus})
     problem = ""
     try:
-        if command == "run":
-            wrote = SessionFolder(folder).journal.is_file()
-            run(played, out, options, screen=screen, confirm=lambda _: wrote)
-        else:
-            measure(played, out, options, screen=screen)
+        with _no_notes_about_drives():
+            if command == "run":
+                wrote = SessionFolder(folder).journal.is_file()
+                run(played, out, options, screen=screen, confirm=lambda _: wrote)
+            else:
+                measure(played, out, options, screen=screen)
     except (DrivesError, FieldtoolError) as error:
         problem = str(error)
     before = SessionFolder(folder).recording
@@ -64,6 +69,25 @@ def again(source: Source, out: Path, screen: Screen | None = None) -> Again:
         differences = (*differences, f"{models[1]} is another model than {models[0]}")
     same = not problem or problem == _how_it_ended(folder)
     return Again(out, same, differences if same else (problem, *differences), rows)
+
+
+@contextmanager
+def _no_notes_about_drives() -> Iterator[None]:
+    """Keep the notes about unfinished writes apart: the drives of a replay are not there.
+
+    A write that was cut off on the real ones does not hinder the replay, and a replay that is cut off
+    leaves nothing behind that would hinder them.
+    """
+    before = os.environ.get(STATE_VARIABLE)
+    with TemporaryDirectory(prefix="fieldtool-replay-") as folder:
+        os.environ[STATE_VARIABLE] = folder
+        try:
+            yield
+        finally:
+            if before is None:
+                del os.environ[STATE_VARIABLE]
+            else:
+                os.environ[STATE_VARIABLE] = before
 
 
 def _session_of(source: Source) -> tuple[str, Options]:

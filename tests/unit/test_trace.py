@@ -109,6 +109,25 @@ def test_stamps_that_count_from_some_other_start_are_moved_to_this_computers_clo
     assert abs(first - os.stat(tmp_path / "t.log").st_mtime) < 30
 
 
+def test_a_sync_that_the_kernel_sent_for_the_host_is_the_hosts(tmp_path: Path) -> None:
+    class Kernel:
+        """Frames of local processes look sent, those of drives served here as well."""
+
+        channel = "vcan0"
+        frames = iter([0x80, 0x18B])
+
+        def recv(self, _timeout: float | None) -> can.Message:
+            return can.Message(arbitration_id=next(self.frames), timestamp=1.0, is_rx=False)
+
+    with traced(Kernel(), tmp_path / "t.asc") as used:  # type: ignore[arg-type]
+        used.recv(1.0)
+        used.recv(1.0)
+    assert [(received, cob) for received, cob, _ in frames_of(tmp_path / "t.asc")] == [
+        (False, 0x80),
+        (True, 0x18B),
+    ]
+
+
 KILLED = """
 import os, signal, sys
 import can
