@@ -1,5 +1,6 @@
 """``fieldtool scan``: what is on the bus, on the screen."""
 
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
@@ -21,6 +22,8 @@ from fieldtool.workflow.scanning import scan as scan_bus
 from fieldtool.workflow.skeleton import write_skeleton
 
 LONGEST_LISTENING = 120.0
+NOBODY = 3
+"""Exit code when no node was found."""
 _STYLES = {"fits": "green", "may fit": "yellow", "does not fit": "red"}
 
 
@@ -66,7 +69,7 @@ def scan(
             progress=told,
         )
     show(console, result)
-    if profile is not None:
+    if profile is not None and result.scan.nodes:
         axes, still_open = write_skeleton(result, profile)
         console.print(
             Text(
@@ -76,6 +79,8 @@ def scan(
         )
     if as_json:
         print_json(result.as_dict())
+    if not result.scan.nodes:
+        sys.exit(NOBODY)
 
 
 def _bus(

@@ -76,6 +76,14 @@ def test_a_bus_that_can_not_be_opened(bench) -> None:
     assert "nowhere" in outcome.err
 
 
+def test_a_bus_with_nobody_on_it(bench) -> None:
+    outcome = bench.command(
+        "scan", "--interface", "virtual", "--channel", "nobody", "--listen", "0.1"
+    )
+    assert outcome.code == 3
+    assert "none of the 127 node ids answered" in words(outcome.out)
+
+
 def filled_in(text: str) -> str:
     """Do what the person does who completes the profile."""
     for key, value in (
