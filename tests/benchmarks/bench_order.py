@@ -3,8 +3,12 @@
 Random machines with couplings, light dampers and some friction; responses on an odd grid with the
 noise of a measured torque.  A machine counts as seen when every mode's largest component stands
 ten standard errors out of the noise, by the information that its true modes have in the data.
-Two axes alone, coupled at their ends, are the same to both motors however the springs are split
-(:mod:`fieldtool.identify.chains.order`): they have a row of their own.
+A machine of two axes, coupled at their ends and without friction at its loads, has twins: machines of
+other lengths with the same responses.  Whether a machine has any is found out here, not asked of the
+tool: a spring is carried over the coupling by a change of coordinates, and the twin counts only if its
+responses, solved from its own matrices, agree to 1e-9 with those of the machine.  No data of the motors
+tell which of them was measured, so such machines have columns of their own: a twin found with a word
+of doubt is all that can be had, one without a word is wrong.
 
 Run: python tests/benchmarks/bench_order.py [machines] [seed]
 """
@@ -68,15 +72,95 @@ def visibility(model, data):
     return omega / (2 * np.pi), np.max(np.abs(at_motors[:, axes:]) / std, axis=0, initial=0.0)
 
 
+def carried_over(axes, coupling, giver):
+    """Carry the last spring of an axis over the coupling; None where it has none to give.
+
+    With x the other's last mass a, y the giver's b on its spring K, p the mass before it, and coupling
+    c, the coordinate z = x + (b / c) (y - p) makes of them: a - c^2 / b at x, K (c / b)^2 from x to z,
+    c^2 / b at z, and p + b; c couples z and p.
+    """
+    (masses, springs, dampers), (taken, theirs, also) = axes[giver], axes[1 - giver]
+    if not springs or not coupling:
+        return None
+    b, ratio = masses[-1], coupling / masses[-1]
+    given = ([*masses[:-2], masses[-2] + b], springs[:-1], dampers[:-1])
+    grown = (
+        [*taken[:-1], taken[-1] - coupling * ratio, coupling * ratio],
+        [*theirs, springs[-1] * ratio**2],
+        [*also, dampers[-1] * ratio**2],
+    )
+    return (given, grown) if giver == 0 else (grown, given)
+
+
+def response(axes, coupling, frictions, omega):
+    """Responses of two coupled chains from their own matrices, shape (F, 2, 2)."""
+    n = [len(chain[0]) for chain in axes]
+    mass = np.diag(np.concatenate([chain[0] for chain in axes]))
+    mass[n[0] - 1, -1] = mass[-1, n[0] - 1] = coupling
+    dynamic = -(omega[:, None, None] ** 2) * mass + 0j
+    for first, (_, springs, dampers), friction in zip((0, n[0]), axes, frictions, strict=True):
+        dynamic[:, first, first] += 1j * omega * friction
+        for k, (spring, damper) in enumerate(zip(springs, dampers, strict=True), start=first):
+            both = (spring + 1j * omega * damper)[:, None, None] * np.array([[1, -1], [-1, 1]])
+            dynamic[:, k : k + 2, k : k + 2] += both
+    motors = [0, n[0]]
+    return np.linalg.inv(dynamic)[:, motors][:, :, motors]
+
+
+def twins(model, omega, longest=5):
+    """Return the lengths of all other machines that have this one's responses to 1e-9."""
+    loads = any(a.load_friction.value for a in model.axes)
+    if len(model.axes) != 2 or not model.couplings or loads:
+        return []
+    axes = tuple(
+        tuple([e.value for e in part] for part in (axis.masses, axis.springs, axis.dampers))
+        for axis in model.axes
+    )
+    coupling = model.couplings[0].value
+    frictions = [axis.viscous_friction.value for axis in model.axes]
+    own, found = machine_response(model, omega), []
+    for giver in (0, 1):
+        other = carried_over(axes, coupling, giver)
+        while other is not None and max(len(chain[0]) for chain in other) <= longest:
+            same = response(other, coupling, frictions, omega)
+            positive = all(value > 0 for chain in other for part in chain for value in part)
+            if positive and np.allclose(same, own, rtol=1e-9, atol=1e-9 * np.abs(own).max(0)):
+                found.append(tuple(len(chain[0]) for chain in other))
+            other = carried_over(other, coupling, giver)
+    return found
+
+
 class Row:
     """Counts of one group of machines."""
 
     def __init__(self, name):
         self.name, self.seconds = name, []
-        self.counts = dict.fromkeys(("seen", "right", "doubted", "faint", "warned", "wrong"), 0)
+        self.counts = dict.fromkeys(
+            (
+                "seen",
+                "right",
+                "doubted",
+                "faint",
+                "warned",
+                "twinned",
+                "itself",
+                "twin",
+                "said",
+                "wrong",
+            ),
+            0,
+        )
 
-    def add(self, seen, right, warned, seconds):
+    def add(self, seen, right, twin, has_twins, warned, seconds):
+        """Count one machine: whether all its modes are seen, and what was found and said."""
         self.seconds.append(seconds)
+        if has_twins and seen:
+            self.counts["twinned"] += 1
+            self.counts["itself"] += right
+            self.counts["twin"] += twin
+            self.counts["said"] += (right or twin) and warned
+            self.counts["wrong"] += not warned
+            return
         self.counts["seen" if seen else "faint"] += 1
         self.counts["right"] += seen and right
         self.counts["doubted"] += seen and right and warned
@@ -84,13 +168,14 @@ class Row:
         self.counts["wrong"] += not right and not warned
 
     def show(self):
+        """Print the row."""
         c = self.counts
         share = 100.0 * c["right"] / max(c["seen"], 1)
         times = np.array(self.seconds) if self.seconds else np.zeros(1)
         print(
-            f"{self.name:26s} {c['seen']:5d} {c['right']:6d} {share:6.1f} % {c['doubted']:8d} "
-            f"{c['faint']:6d} {c['warned']:7d} {c['wrong']:6d} {np.median(times):8.2f} "
-            f"{times.max():6.2f}",
+            f"{self.name:29s} {c['seen']:5d} {c['right']:6d} {share:6.1f} % {c['doubted']:8d} "
+            f"{c['faint']:6d} {c['warned']:7d} {c['twinned']:8d} {c['itself']:7d} {c['twin']:6d} "
+            f"{c['said']:5d} {c['wrong']:6d} {np.median(times):8.2f} {times.max():6.2f}",
             flush=True,
         )
 
@@ -105,16 +190,21 @@ def study(rng, row, machines, spread, friction, lengths=None):
         start = time.perf_counter()
         try:
             found = select_order(data)
-            right = tuple(found.masses.values()) == chosen
-            warned = bool(found.doubts)
+            lengths = tuple(found.masses.values())
+            right, warned = lengths == chosen, bool(found.doubts)
         except IdentificationError as error:
-            right, warned = False, True
+            lengths, right, warned = (), False, True
             print(f"  refused {chosen}, faintest {heights.min(initial=np.inf):.3g}: {error}")
         seconds = time.perf_counter() - start
         seen = bool(np.all(heights > SEEN))
-        row.add(seen, right, warned, seconds)
-        if not right:
-            print(f"  {chosen} faintest {heights.min(initial=np.inf):.3g}, warned: {warned}")
+        others = twins(model, data.omega)
+        row.add(seen, right, lengths in others, bool(others), warned, seconds)
+        if not right and lengths:
+            kind = "a twin" if lengths in others else "no twin"
+            print(
+                f"  {chosen} found as {lengths}, {kind}, faintest {heights.min(initial=np.inf):.3g}, "
+                f"warned: {warned}"
+            )
 
 
 def main(machines=100, seed=None):
@@ -123,10 +213,13 @@ def main(machines=100, seed=None):
     rng = np.random.default_rng(seed)
     print(f"{machines} machines a row, seed {seed}")
     print(
-        "machines                    seen  right   share  doubted  faint  warned  wrong   median s"
-        "    max"
+        "machines                       seen  right   share  doubted  faint  warned  twinned  itself"
+        "   twin  said  wrong median s    max"
     )
-    print("(seen: every mode over 10 standard errors; wrong: not right and no word of doubt)")
+    print(
+        "(seen: every mode over 10 standard errors and no twin; twinned: seen, but other lengths give "
+        "the same responses; said: with a word of doubt; wrong: not right, or a twin, and no such word)"
+    )
     groups = (
         ("1-4 axes x 1-4, friction", 0.3, True, None, machines),
         ("the same, values x 1/2.5-2.5", 0.9, True, None, machines),
