@@ -34,7 +34,7 @@ from fieldtool.frf.stepped.responses import SteppedResult
 from fieldtool.identify.chains.modal_chain import reduction_inputs
 from fieldtool.identify.chains.order_reduction import CrossGain, ReducedMachine, reduce_machine
 from fieldtool.identify.likelihood.refine import refine
-from fieldtool.identify.likelihood.response_data import ResponseMatrix
+from fieldtool.identify.likelihood.response_data import ResponseMatrix, matrix_of
 from fieldtool.identify.modes.fit import fit_modes
 from fieldtool.identify.modes.model import ModalModel
 from fieldtool.records.model import Estimate, FloatArray, Kind, MachineModel
@@ -106,7 +106,7 @@ def identify_classic(
             "no sweep lets the other axes float, so there are no resonances to read. Measure with "
             "the classic plan."
         )
-    data = response_matrix(free)
+    data = matrix_of(free, RELATIVE_FLOOR)
     modal = fit_modes(
         data,
         sum(masses[name] - 1 for name in free.axes),
@@ -138,12 +138,6 @@ def identify_classic(
     model, refinement = _refined(reduced.model, data, modal)
     notes += [*reduced.notes, *refinement]
     return ClassicResult(model, modal, reduced, free, low, measured_cross, tuple(notes))
-
-
-def response_matrix(response: FrequencyResponse) -> ResponseMatrix:
-    """Return a response as the fits take it, its errors not below RELATIVE_FLOOR."""
-    std = np.hypot(response.complex_std, RELATIVE_FLOOR * np.abs(response.response))
-    return ResponseMatrix(response.axes, 2 * np.pi * response.frequencies, response.response, std)
 
 
 def held_gains(

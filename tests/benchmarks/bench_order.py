@@ -134,7 +134,7 @@ class Row:
     """Counts of one group of machines."""
 
     def __init__(self, name):
-        self.name, self.seconds = name, []
+        self.name, self.seconds, self.shapes = name, [], set()
         self.counts = dict.fromkeys(
             (
                 "seen",
@@ -151,8 +151,9 @@ class Row:
             0,
         )
 
-    def add(self, seen, right, twin, has_twins, warned, seconds):
-        """Count one machine: whether all its modes are seen, and what was found and said."""
+    def add(self, chosen, seen, right, twin, has_twins, warned, seconds):
+        """Count one machine: its lengths, whether all modes are seen, what was found and said."""
+        self.shapes.add(chosen)
         self.seconds.append(seconds)
         if has_twins and seen:
             self.counts["twinned"] += 1
@@ -175,7 +176,8 @@ class Row:
         print(
             f"{self.name:29s} {c['seen']:5d} {c['right']:6d} {share:6.1f} % {c['doubted']:8d} "
             f"{c['faint']:6d} {c['warned']:7d} {c['twinned']:8d} {c['itself']:7d} {c['twin']:6d} "
-            f"{c['said']:5d} {c['wrong']:6d} {np.median(times):8.2f} {times.max():6.2f}",
+            f"{c['said']:5d} {c['wrong']:6d} {np.median(times):8.2f} {times.max():6.2f} "
+            f"{len(self.shapes):7d}",
             flush=True,
         )
 
@@ -190,19 +192,19 @@ def study(rng, row, machines, spread, friction, lengths=None):
         start = time.perf_counter()
         try:
             found = select_order(data)
-            lengths = tuple(found.masses.values())
-            right, warned = lengths == chosen, bool(found.doubts)
+            answer = tuple(found.masses.values())
+            right, warned = answer == chosen, bool(found.doubts)
         except IdentificationError as error:
-            lengths, right, warned = (), False, True
+            answer, right, warned = (), False, True
             print(f"  refused {chosen}, faintest {heights.min(initial=np.inf):.3g}: {error}")
         seconds = time.perf_counter() - start
         seen = bool(np.all(heights > SEEN))
         others = twins(model, data.omega)
-        row.add(seen, right, lengths in others, bool(others), warned, seconds)
-        if not right and lengths:
-            kind = "a twin" if lengths in others else "no twin"
+        row.add(chosen, seen, right, answer in others, bool(others), warned, seconds)
+        if not right and answer:
+            kind = "a twin" if answer in others else "no twin"
             print(
-                f"  {chosen} found as {lengths}, {kind}, faintest {heights.min(initial=np.inf):.3g}, "
+                f"  {chosen} found as {answer}, {kind}, faintest {heights.min(initial=np.inf):.3g}, "
                 f"warned: {warned}"
             )
 
@@ -214,7 +216,7 @@ def main(machines=100, seed=None):
     print(f"{machines} machines a row, seed {seed}")
     print(
         "machines                       seen  right   share  doubted  faint  warned  twinned  itself"
-        "   twin  said  wrong median s    max"
+        "   twin  said  wrong median s    max  shapes"
     )
     print(
         "(seen: every mode over 10 standard errors and no twin; twinned: seen, but other lengths give "

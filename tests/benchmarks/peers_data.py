@@ -14,8 +14,7 @@ from drives.profile import load_machine
 from fieldtool.frf.matrix import column_responses
 from fieldtool.frf.multisine.matrix import joint_response
 from fieldtool.frf.multisine.single_axis import analyse_multisine
-from fieldtool.identify.likelihood.response_data import ResponseMatrix
-from fieldtool.identify.multisine.identify import matrix_of
+from fieldtool.identify.likelihood.response_data import ResponseMatrix, matrix_of
 from fieldtool.records.csv_folder import read_folder
 from fieldtool.records.model import MachineModel
 from fieldtool.records.recording import Recording, load

@@ -6,9 +6,9 @@ equation error G T - Theta.  Its covariance is [G -I] C [G -I]^H with C that of 
 errors-in-variables likelihood of Pintelon and Schoukens, System Identification, section 8.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,16 +60,10 @@ class JointSpectra:
         white = np.matmul(self._whitening(floor), moved).reshape(-1, derivatives.shape[-1])
         return np.concatenate([white.real, white.imag])
 
-    def _whitening(self, floor: float) -> ComplexArray:
-        """Matrices W with W C W^H = 2: parts have variance 1, shape (R, M, M)."""
-        kept: dict[float, ComplexArray] = self._whitenings
-        if floor not in kept:
-            kept[floor] = self._whitened(floor)
-        return kept[floor]
-
     @cached_property
-    def _whitenings(self) -> dict[float, ComplexArray]:
-        return {}
+    def _whitening(self) -> Callable[[float], ComplexArray]:
+        """Matrices W with W C W^H = 2 by floor: parts have variance 1, shape (R, M, M); each kept."""
+        return cache(self._whitened)
 
     def _whitened(self, floor: float) -> ComplexArray:
         covariance = self.covariance

@@ -1,12 +1,14 @@
 """Measured frequency responses, as the fits take them."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fieldtool.errors import NotEnoughDataError
+from fieldtool.frf.response import FrequencyResponse
 from fieldtool.identify.likelihood.whitening import whitening
 
 FloatArray = NDArray[np.float64]
@@ -117,16 +119,10 @@ class ResponseMatrix:
         """Lines with values."""
         return np.flatnonzero(self.measured[:, 0, 0])
 
-    def _whitening(self, floor: float) -> ComplexArray:
-        """Matrices W with W C W^H = 2, so that parts have variance 1, shape (lines, M*M, M*M)."""
-        kept: dict[float, ComplexArray] = self._whitenings
-        if floor not in kept:
-            kept[floor] = self._whitened(floor)
-        return kept[floor]
-
     @cached_property
-    def _whitenings(self) -> dict[float, ComplexArray]:
-        return {}
+    def _whitening(self) -> Callable[[float], ComplexArray]:
+        """Matrices W with W C W^H = 2 by floor, shape (lines, M*M, M*M); each kept."""
+        return cache(self._whitened)
 
     def _whitened(self, floor: float) -> ComplexArray:
         if self.covariance is None:
@@ -161,3 +157,19 @@ class ResponseMatrix:
         added = floor * np.sqrt(largest[:, :, None] * largest[:, None, :])
         result: FloatArray = np.hypot(self.std, added)
         return result
+
+
+def matrix_of(response: FrequencyResponse, floor: float = 0.0) -> ResponseMatrix:
+    """Return a response as the fits take it.
+
+    Parameters
+    ----------
+    response
+    floor
+        Relative error of the method that is added to each value's noise; errors then count as
+        independent.  Without it the covariance of the elements is kept.
+    """
+    std = np.hypot(response.complex_std, floor * np.abs(response.response))
+    covariance = None if floor else response.covariance
+    omega = 2 * np.pi * response.frequencies
+    return ResponseMatrix(response.axes, omega, response.response, std, covariance)

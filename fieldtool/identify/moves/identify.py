@@ -26,7 +26,7 @@ from fieldtool.frf.response import FrequencyResponse
 from fieldtool.identify.chains.modal_chain import reduce_modes
 from fieldtool.identify.likelihood.least_squares import standard_errors
 from fieldtool.identify.likelihood.refine import RefinedModel
-from fieldtool.identify.likelihood.response_data import ResponseMatrix
+from fieldtool.identify.likelihood.response_data import matrix_of
 from fieldtool.identify.modes.fit import fit_modes
 from fieldtool.identify.moves.motion_spectra import (
     Motion,
@@ -147,8 +147,7 @@ def _elastic_start(
     response: FrequencyResponse, lengths: Mapping[str, int], kinds: Mapping[str, Kind]
 ) -> MachineModel:
     """Build start values from modes and order reduction."""
-    std = np.hypot(response.complex_std, START_SHARE * np.abs(response.response))
-    data = ResponseMatrix(response.axes, 2 * np.pi * response.frequencies, response.response, std)
+    data = matrix_of(response, START_SHARE)
     modes = sum(lengths.values()) - len(lengths)
     try:
         modal = fit_modes(data, modes, fit_friction=True, fit_delay=True)

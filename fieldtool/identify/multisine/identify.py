@@ -25,7 +25,7 @@ from fieldtool.identify.chains.order import OrderSelection, select_order
 from fieldtool.identify.classic import without_friction, without_friction_seen
 from fieldtool.identify.likelihood.joint_data import frequencies_of, joint_spectra
 from fieldtool.identify.likelihood.refine import RefinedModel, machine_response, refine
-from fieldtool.identify.likelihood.response_data import ResponseMatrix
+from fieldtool.identify.likelihood.response_data import ResponseMatrix, matrix_of
 from fieldtool.identify.modes.fit import fit_modes
 from fieldtool.identify.modes.model import ModalModel
 from fieldtool.identify.modes.search import find_modes
@@ -168,17 +168,6 @@ def _told_of_distortion(measured: JointResult) -> Iterator[None]:
                 "larger amplitude or on top of a constant velocity, and check the axis for play."
             )
         raise
-
-
-def matrix_of(response: FrequencyResponse) -> ResponseMatrix:
-    """Return a response as the fits take it, with the covariance of its elements."""
-    return ResponseMatrix(
-        response.axes,
-        2 * np.pi * response.frequencies,
-        response.response,
-        response.complex_std,
-        response.covariance,
-    )
 
 
 def _responses(solved: FrequencyResponse) -> dict[str, FrequencyResponse]:
