@@ -215,6 +215,8 @@ def replay(
 
 def _compared(recording: Recording, rebuilding: Rebuilding) -> Iterator[Found]:
     data, start = rebuilding.result(), 0
+    if not data.time.size:  # nothing moved while it was traced: a write, or a restore
+        return
     for one in recording.experiments:
         position, torque = np.asarray(one.position), np.asarray(one.torque)
         pieces = find(data, position, torque, start)

@@ -67,6 +67,14 @@ def test_a_session_is_shown_again_from_its_trace(traced) -> None:
     assert traced.machine.sync_count == syncs, "no drive was asked"
 
     one_wrong_bit_is_seen(traced)
+    a_trace_without_motion_has_no_recording(traced)
+
+
+def a_trace_without_motion_has_no_recording(traced) -> None:
+    other = traced.out / "other.log"
+    other.write_text("(1.000000) can0 70B#7F R\n(2.000000) can0 70B#7F R\n")
+    outcome = traced.command("replay", other, "--json")
+    assert json.loads(outcome.out)["recording"] == []
 
 
 def frames_are_shown_and_filtered(traced) -> None:
