@@ -25,6 +25,12 @@ HEARTBEATS_MISSED = 3.5
 SPAN_UNITS = 20
 """The velocity is judged over so many cycles too that its limit is at least so many units: with a
 coarse encoder one unit a cycle is already much."""
+STRAY_ALLOWED = 2
+"""Cycles in a row in which a PDO may come that no SYNC of the host's asked for."""
+JUMP_TORQUES, JUMP_UNITS, JUMP_CYCLES = 4.0, 4, 10
+"""From one cycle to the next a position can not change more than it did before by what so many times
+the torque limit does to the motor alone, nor by its way at the velocity limit (an impact may take all
+of that), and so many units: then its encoder has jumped.  It is said of a stop so many cycles later."""
 STUCK_SHARE, STUCK_UNITS, STUCK_TIME = 8, 20, 0.02
 """A target that moves by a part of the following error window, and by so many units at least,
 while the position does not change at all for so many seconds: the encoder is stuck, or the axis is
@@ -60,6 +66,18 @@ class Channel:
     missing: int = 0
     paused: float = 0.0
     """Cycles by which SYNC was late since the last sample: the axis had more time to move."""
+    stray: int = 0
+    """Cycles in a row with a PDO that no SYNC of the host's asked for."""
+    strayed: bool = False
+    """Whether a PDO came since the last SYNC that answers none of the host's, or a second one."""
+    contradicts: bool = False
+    """Whether PDOs showed a drive under power that said of itself that it is off."""
+    jump: int = _MOST_UNITS
+    """Position units by which a position can not change more than it did the cycle before."""
+    jumped: int = 0
+    """By how much it did all the same; 0 if it did not lately."""
+    jumped_ago: int = 0
+    step_before: int | None = None
     heard: float = 0.0
     emergencies: list[int] = field(default_factory=list)
     nmt_state: int = NMT_OPERATIONAL
@@ -107,10 +125,22 @@ class Channel:
         self.still += 1
         if self.position != self.previous:
             self.anchor, self.still = None, 0
+        self._judge_jump()
         cycles = 1 + self.missing + self.paused
         self.allowed = ceil(self.step * cycles)
         self._judge_span(cycles)
         self.missing, self.paused = 0, 0.0
+
+    def _judge_jump(self) -> None:
+        step = self.position - self.previous
+        if self.jumped_ago:
+            self.jumped_ago -= 1
+        even = not self.missing and not self.paused
+        if even and self.step_before is not None and not self.jumped_ago:
+            change = step - self.step_before
+            if abs(change) > self.jump:
+                self.jumped, self.jumped_ago = change, JUMP_CYCLES
+        self.step_before = step if even else None
 
     def _judge_span(self, cycles: float) -> None:
         if self.span_begin is None:
@@ -142,6 +172,7 @@ class Channel:
             and not self.is_stuck(target)
             and not self.emergencies
             and self.missing <= MISSING_ALLOWED
+            and self.stray <= STRAY_ALLOWED
             and self.nmt_state == NMT_OPERATIONAL
             and not self.rebooted
             and now - self.heard <= HEARTBEATS_MISSED * DRIVE_HEARTBEAT
@@ -152,6 +183,12 @@ class Channel:
         drive, scale, limits = self.drive, self.drive.scaling, self.drive.limits
         unit, torque_unit = drive.position_unit, drive.torque_unit
         statusword, position, torque = INPUT.unpack(self.last)
+        if self.stray > STRAY_ALLOWED:
+            return (
+                f"{drive.axis}: PDOs of node {drive.node_id} come that no SYNC of this host asked for; "
+                "all axes were stopped. Two drives may have this node id, another master may send "
+                "SYNC, or the drive answers too late for the cycle."
+            )
         if self.missing > MISSING_ALLOWED:
             return (
                 f"{drive.axis}: node {drive.node_id} sent no PDO for {self.missing} cycles; all "
@@ -162,6 +199,14 @@ class Channel:
                 f"{drive.axis}: node {drive.node_id} left NMT operational"
                 f"{' (it rebooted)' if self.rebooted else ''}; all axes were stopped. Check its "
                 "supply, and whether another master is on the bus."
+            )
+        if self.jumped_ago:
+            return (
+                f"{drive.axis}: its position jumped by {self.jumped * scale.position:.4g} {unit} from "
+                f"one cycle to the next, which is above the limit {self.jump * scale.position:.3g} "
+                f"{unit} of what its torque and velocity allow; all axes were stopped. Either its "
+                "encoder lost count (cable, shield, index), and the position is not known any more "
+                "until it is referenced, or something hit the axis."
             )
         if self.emergencies or statusword & ENABLED_MASK != ENABLED_VALUE:
             return self.trouble()
@@ -231,6 +276,10 @@ def channel_of(
     scale, limits = drive.scaling, drive.limits
     units = min(limits.velocity * cycle_time / scale.position, _MOST_UNITS)
     span = ceil(SPAN_UNITS / units)
+    lightest = drive.axis_profile.prior.masses[0]
+    kick = max(
+        JUMP_TORQUES * limits.torque / lightest * cycle_time**2, limits.velocity * cycle_time
+    )
     window = floor(min(limits.following_error / scale.position * (1 + 1e-12), _MOST_UNITS))
     return Channel(
         drive,
@@ -239,6 +288,7 @@ def channel_of(
         low=scale.position_units(limits.travel[0]),
         high=scale.position_units(limits.travel[1]),
         step=max(2, 1 + floor(units)),
+        jump=JUMP_UNITS + ceil(min(kick / scale.position, _MOST_UNITS)),
         span=span,
         span_units=1 + floor(units * span),
         torque=floor(min(limits.torque / scale.torque * (1 + 1e-12), _MOST_UNITS)),

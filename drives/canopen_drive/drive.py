@@ -38,6 +38,8 @@ logging.getLogger("canopen").setLevel(logging.CRITICAL)  # what goes wrong is ra
 
 CIA402_DEVICE = 402
 STOP_NODE, ENTER_PRE_OPERATIONAL = 0x02, 0x80
+QUICK_STOP = 0x0002
+"""Controlword."""
 
 
 class CanopenDrive:
@@ -327,6 +329,13 @@ class CanopenDrive:
                 self.node.nmt.send_command(ENTER_PRE_OPERATIONAL)
         return True
 
+    @property
+    def unasked_answers(self) -> int:
+        """SDO answers that came and that nobody had asked for."""
+        client = self.node.sdo
+        client.forget_old()
+        return int(client.unasked)
+
     def _text(self, info: ObjectInfo) -> str:
         try:
             return str(self.read(info))
@@ -448,13 +457,24 @@ class CanopenDrive:
             return "not readable"
         return emergency_text(code & 0xFFFF) if code else "not recorded"
 
-    def switch_off(self) -> int | None:
-        """Write controlword 0 and return the statusword then, by SDO; None if there is no answer."""
+    def switch_off(self, stopped: bool = False) -> int | None:
+        """Write controlword 0 and return the statusword then, by SDO; None if there is no answer.
+
+        A node that was ``stopped`` answers no SDO: it is led to pre-operational first.
+        """
         try:
+            if stopped:
+                self.node.nmt.send_command(ENTER_PRE_OPERATIONAL)
             self.write(objects.CONTROLWORD, 0)
             return self.read_int(objects.STATUSWORD)
         except DrivesError:
             return None
+
+    def order_quick_stop(self) -> None:
+        """Ask for a quick stop by SDO, without waiting for an answer: for a drive without PDOs."""
+        request = struct.pack("<BHBHxx", 0x2B, objects.CONTROLWORD.address.index, 0, QUICK_STOP)
+        with suppress(DrivesError):
+            self.line.send_message(0x600 + self.node_id, request)
 
     def stop_node(self) -> None:
         """Send NMT stop to the node; a bus that does not take it changes nothing."""

@@ -16,7 +16,8 @@ from drives.canopen_drive.line import Line
 from drives.canopen_drive.motion import CanopenMotion
 from drives.canopen_drive.pace import Punctuality, undisturbed
 from drives.canopen_drive.recovery import recover
-from drives.canopen_drive.sync import SYNC_ID, HostSync, KernelSync
+from drives.canopen_drive.strangers import Strangers, commands
+from drives.canopen_drive.sync import HostSync, KernelSync
 from drives.canopen_drive.torque_offset import why_not
 from drives.cia402 import Mode
 from drives.errors import DrivesError, LimitsError, NothingMovedError, NotSupportedError
@@ -279,9 +280,10 @@ class CanopenGroup:
 
 
 def _identifiers(drives: Sequence[CanopenDrive]) -> list[int]:
-    """What matters while axes move: SYNC, and each drive's emergencies, PDO, SDO and heartbeat."""
+    """What matters while axes move: what drives send, and what only this host may send."""
     services = (0x080, 0x180, 0x580, 0x700)
-    return [SYNC_ID, *(service + d.node_id for d in drives for service in services)]
+    own = [service + d.node_id for d in drives for service in services]
+    return sorted({*own, *Strangers(drives, setup.HOST_NODE_ID).identifiers})
 
 
 @contextmanager
@@ -372,16 +374,21 @@ def _check_alone(line: Line, drives: Sequence[CanopenDrive]) -> None:
     Raises
     ------
     NothingMovedError
-        Naming the frame: a SYNC, the host's own heartbeat, or targets for one of our drives.
+        Naming the frame: a SYNC, the host's own heartbeat, or targets for one of our drives; or the
+        node that two drives answer for.
     """
-    commands = {0x080: "a SYNC", 0x700 + setup.HOST_NODE_ID: "the host's own heartbeat"}
-    for drive in drives:
-        for base in (0x200, 0x300, 0x400, 0x500):
-            commands[base + drive.node_id] = f"targets (a PDO) for {drive.axis}"
     heard = line.listen(LISTENING_TIME)
-    foreign = [text for cob_id, text in commands.items() if cob_id in heard]
+    cyclic = commands(drives, setup.HOST_NODE_ID)
+    foreign = [text for cob_id, text in cyclic.items() if cob_id in heard]
     if foreign:
         raise NothingMovedError(
             f"somebody else sends {' and '.join(foreign)} on this bus; two masters must not command "
             "one machine. Stop the other controller first."
         )
+    for drive in drives:
+        if drive.unasked_answers:
+            raise NothingMovedError(
+                f"{drive.axis}: node {drive.node_id} answers more often than it is asked: two drives "
+                "have this node id, or another program talks to it. Give every drive an id of its own, "
+                "and close other programs."
+            )

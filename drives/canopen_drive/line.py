@@ -11,17 +11,18 @@ from math import inf
 
 import can
 import canopen
-from canopen.sdo import SdoClient, SdoCommunicationError
 
 from drives.bus import Clock, bus_state, clock_of, trouble_of
+from drives.canopen_drive.sdo import StrictSdoClient
 from drives.errors import BusError
 
 NMT_OPERATIONAL = 5
+NMT_STATES = (0, 4, NMT_OPERATIONAL, 127)
+"""That a heartbeat can show: boot-up, stopped, operational, pre-operational."""
+NMT_ID, NMT_BYTES = 0x000, 2
 EMERGENCY_IDS, EMERGENCY_BYTES, HEARTBEAT_ID = (0x81, 0xFF), 8, 0x700
 SHORTEST_WAIT = 1e-4
 """Seconds; a difference of two times may be smaller than a clock can tell."""
-SDO_TIMEOUT = 0.5
-"""Seconds a drive may take for an ordinary SDO answer."""
 
 
 class Line(canopen.Network):  # type: ignore[misc]
@@ -166,8 +167,10 @@ class Line(canopen.Network):  # type: ignore[misc]
         """Hand a frame on to those who subscribed; one that is too short can not harm them."""
         if EMERGENCY_IDS[0] <= can_id <= EMERGENCY_IDS[1] and len(data) < EMERGENCY_BYTES:
             data = bytearray(data) + bytes(EMERGENCY_BYTES - len(data))
-        if can_id > HEARTBEAT_ID and not data:
-            return
+        if can_id > HEARTBEAT_ID and (not data or data[0] & 0x7F not in NMT_STATES):
+            return  # no heartbeat of any node; `canopen` would stumble over it
+        if can_id == NMT_ID and len(data) < NMT_BYTES:
+            return  # no command, likewise
         super().notify(can_id, data, timestamp)
 
     def wait(self, seconds: float, until: Callable[[], bool] = lambda: False) -> bool:
@@ -181,24 +184,11 @@ class Line(canopen.Network):  # type: ignore[misc]
         return True
 
 
-class PumpedSdoClient(SdoClient):  # type: ignore[misc]
-    """``canopen``'s SDO client, which receives by itself while it waits."""
-
-    RESPONSE_TIMEOUT = SDO_TIMEOUT
-
-    def read_response(self) -> bytes:
-        """Wait for the answer; raise as ``canopen`` does if there is none."""
-        self.network.wait(self.RESPONSE_TIMEOUT, lambda: not self.responses.empty())
-        if self.responses.empty():
-            raise SdoCommunicationError("No SDO response received")
-        return super().read_response()  # type: ignore[no-any-return]
-
-
 class Node(canopen.RemoteNode):  # type: ignore[misc]
     """``canopen``'s remote node with the SDO client above."""
 
-    def add_sdo(self, rx_cobid: int, tx_cobid: int) -> PumpedSdoClient:
+    def add_sdo(self, rx_cobid: int, tx_cobid: int) -> StrictSdoClient:
         """Add an SDO channel."""
-        client = PumpedSdoClient(rx_cobid, tx_cobid, self.object_dictionary)
+        client = StrictSdoClient(rx_cobid, tx_cobid, self.object_dictionary)
         self.sdo_channels.append(client)
         return client

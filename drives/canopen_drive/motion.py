@@ -6,10 +6,12 @@ loop of the wrong sign would only make it faster.
 """
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 
 import can
 import numpy as np
 
+from drives import objects
 from drives.api import Capture, FloatArray, Source, Targets, joined
 from drives.canopen_drive.channel import INPUT, OUTPUT, Channel, channel_of
 from drives.canopen_drive.drive import CanopenDrive
@@ -17,17 +19,20 @@ from drives.canopen_drive.interrupts import uninterrupted
 from drives.canopen_drive.line import Line
 from drives.canopen_drive.outputs import Outputs, outputs_of
 from drives.canopen_drive.pace import LATE_SHARE, Punctuality
-from drives.canopen_drive.setup import HOST_HEARTBEAT, HOST_LOST_AFTER
+from drives.canopen_drive.setup import HOST_HEARTBEAT, HOST_LOST_AFTER, HOST_NODE_ID
+from drives.canopen_drive.strangers import Strangers
 from drives.canopen_drive.sync import HostSync, Sync
-from drives.cia402 import ENABLED_VALUE, STEP_TOWARDS_ENABLED, Controlword, PowerState
+from drives.cia402 import ENABLED_VALUE, STEP_TOWARDS_ENABLED, Controlword, Mode, PowerState
 from drives.errors import (
     DriveFaultError,
     DrivesError,
     SafetyStopError,
+    SdoError,
     StoppedError,
     UserStopError,
 )
 
+NMT_STOPPED = 4
 INPUT_ROW = np.dtype([("statusword", "<u2"), ("position", "<i4"), ("torque", "<i2")])
 
 STATE_TIMEOUT = 3.0
@@ -71,6 +76,9 @@ class CanopenMotion:
         self._lost = line.overruns
         self._lost_before = self._lost
         self._count = 0
+        self._strangers = Strangers(drives, HOST_NODE_ID)
+        self._stranger = ""
+        """What somebody else has commanded, in words."""
         self._stopped = False
         self.perhaps_enabled: dict[str, str] = {}
         """Axes whose drive could not be seen to be off after a stop: a sentence each."""
@@ -179,10 +187,10 @@ class CanopenMotion:
         After a pause without SYNC nothing old is on its way; a PDO that comes too late would be
         taken for the next cycle's ever after.
         """
-        self._line.wait(PAUSE_CYCLES * self._cycle_time)
-        self._sync.restart()
         words = [self._word(c, Controlword.DISABLE_VOLTAGE) for c in self._channels]
         for _ in range(REPLY_TRIES):
+            self._line.wait(PAUSE_CYCLES * self._cycle_time)
+            self._sync.restart()
             if self._cycle(words):
                 return
         late = next((c for c in self._channels if c.missing), self._channels[0])
@@ -197,6 +205,7 @@ class CanopenMotion:
         for _ in range(round(len(STEP_TOWARDS_ENABLED) * STATE_TIMEOUT / self._cycle_time)):
             self._cycle([self._word(c, _next_word(c.state)) for c in self._channels])
             self._check_user()
+            self._check_strangers()
             for channel in self._channels:
                 self._check_enabling(channel)
             if all(c.state is PowerState.OPERATION_ENABLED for c in self._channels):
@@ -230,11 +239,76 @@ class CanopenMotion:
                     self._make_sure_off()
                 if self.perhaps_enabled:
                     raise SafetyStopError(" ".join(self.perhaps_enabled.values()))
+                self._check_trust()
         finally:
             for channel in self._channels:
                 node_id = channel.drive.node_id
                 self._line.unsubscribe(0x80 + node_id, self._on_emergency)
                 self._line.unsubscribe(0x700 + node_id, self._on_heartbeat)
+
+    def _check_trust(self) -> None:
+        """See that what was measured can be believed: with all axes off, at the end of a motion.
+
+        Raises
+        ------
+        SafetyStopError
+            If a drive's PDOs come too late, show another state than the drive has, or it is in
+            another mode than it was set to.
+        """
+        for channel in self._channels:
+            drive = channel.drive
+            if channel.contradicts:
+                raise SafetyStopError(
+                    f"{drive.axis}: the PDOs of node {drive.node_id} show statusword "
+                    f"0x{channel.statusword:04X}, the drive itself (object 0x6041:00) shows that it is "
+                    "off: a fault would not have been seen. All axes are disabled; what was measured "
+                    "is kept, but do not rely on it. Switch the drive off and on.",
+                    axis=drive.axis,
+                )
+            self._check_mode(channel)
+        try:
+            self._check_replies()
+        except DriveFaultError as error:
+            raise SafetyStopError(
+                f"{error} It was so at the end of a motion: what was measured in it is kept, but do not "
+                "rely on it."
+            ) from error
+
+    def _check_mode(self, channel: Channel) -> None:
+        wrong = self._wrong_mode(channel)
+        if wrong:
+            raise SafetyStopError(wrong, axis=channel.drive.axis)
+
+    @staticmethod
+    def _wrong_mode(channel: Channel) -> str:
+        """Return a sentence if a drive is in another mode than it was set to; else nothing."""
+        drive = channel.drive
+        wanted = Mode.CYCLIC_TORQUE if channel.free else Mode.CYCLIC_POSITION
+        try:
+            shown = drive.read_int(objects.MODE_DISPLAY)
+        except SdoError:  # one answer that is lost must not spoil what was measured
+            shown = drive.read_int(objects.MODE_DISPLAY)
+        if shown == wanted.value:
+            return ""
+        names = {mode.value: mode.words for mode in Mode}
+        return (
+            f"{drive.axis}: the drive left mode {wanted.words} ({wanted.value}) by itself: object "
+            f"0x6061:00 shows {shown} ({names.get(shown, 'a mode of its maker')}), so it did not follow "
+            "its targets. All axes are disabled; what was measured in this motion is kept, but do not "
+            "rely on it. Look for what else sets the mode: an input, a program in the drive, another "
+            "master."
+        )
+
+    def _explain(self, cause: BaseException) -> None:
+        """Add what the stopped axis' drive says of itself to the error, if that explains it."""
+        if not isinstance(cause, SafetyStopError) or cause.axis is None or self.perhaps_enabled:
+            return
+        channel = next((c for c in self._channels if c.drive.axis == cause.axis), None)
+        if channel is not None and not channel.missing:
+            with suppress(DrivesError):
+                wrong = self._wrong_mode(channel)
+                if wrong:
+                    cause.add_note(wrong)
 
     def stop(self, cause: BaseException | None = None) -> None:
         """Quick stop all axes at once, then disable them; never raises for what a drive does.
@@ -253,6 +327,7 @@ class CanopenMotion:
             if cause is not None:
                 for sentence in self.perhaps_enabled.values():
                     cause.add_note(sentence)
+                self._explain(cause)
 
     def _make_sure_off(self) -> None:
         """Believe only a fresh statusword; else switch off by SDO, and say what stays unknown.
@@ -264,7 +339,9 @@ class CanopenMotion:
             if not channel.missing and _is_off(channel.statusword):
                 continue
             drive = channel.drive
-            state = drive.switch_off()
+            stopped = channel.nmt_state == NMT_STOPPED or bool(self._stranger)
+            state = drive.switch_off(stopped)
+            channel.contradicts = not channel.missing and state is not None and _is_off(state)
             if state is None or not _is_off(state):
                 shown = "does not answer" if state is None else f"shows statusword 0x{state:04X}"
                 self.perhaps_enabled[drive.axis] = (
@@ -288,6 +365,9 @@ class CanopenMotion:
     def _quick_stop(self, runaway: str | None) -> None:
         """Command a quick stop until every axis stands or is off; cut the power of a runaway."""
         channels = self._channels
+        for channel in channels:
+            if channel.missing:  # perhaps it does not take part in SYNC or PDO any more
+                channel.drive.order_quick_stop()
         words = [
             Controlword.DISABLE_VOLTAGE if c.drive.axis == runaway else Controlword.QUICK_STOP
             for c in channels
@@ -391,6 +471,9 @@ class CanopenMotion:
         moment = self._sync.give(self._early)
         self._count += 1
         self._note_pause(moment)
+        for channel in self._channels:
+            channel.stray = channel.stray + 1 if channel.strayed else 0
+            channel.strayed = False
         complete = self._collect(moment + REPLY_SHARE * self._cycle_time)
         spoiled = self._disturbed or self._sync.lateness > 0 or self._lost_frames()
         return complete and not spoiled
@@ -413,8 +496,9 @@ class CanopenMotion:
 
         A drive's PDO among them came too late for its SYNC, or answers a SYNC that is not ours.
         """
-        if message.arbitration_id in self._by_cob and not message.is_extended_id:
-            self._disturbed = True
+        k = self._by_cob.get(message.arbitration_id)
+        if k is not None and not message.is_extended_id:
+            self._channels[k].strayed = self._disturbed = True
         else:
             self._hand_on(message)
 
@@ -428,14 +512,17 @@ class CanopenMotion:
             k = by_cob.get(message.arbitration_id)
             if k is None or message.is_extended_id or len(message.data) != INPUT.size:
                 self._hand_on(message)
-                continue
-            channels[k].take(bytes(message.data))
-            awaited.discard(k)
+            elif k in awaited:
+                channels[k].take(bytes(message.data))
+                awaited.discard(k)
+            else:
+                channels[k].strayed = True
         for k in awaited:
             channels[k].missing += 1
-        return not awaited
+        return not awaited and not any(c.strayed for c in channels)
 
     def _hand_on(self, message: can.Message) -> None:
+        self._stranger = self._stranger or self._strangers.command(message)
         if not (message.is_error_frame or message.is_remote_frame or message.is_extended_id):
             self._line.notify(message.arbitration_id, message.data, message.timestamp)
 
@@ -474,10 +561,19 @@ class CanopenMotion:
                 "then is kept."
             )
 
+    def _check_strangers(self) -> None:
+        if self._stranger:
+            raise SafetyStopError(
+                f"somebody else sends {self._stranger} on this bus; all axes were stopped. Two masters "
+                "must not command one machine: stop the other controller first.",
+                cycle=self._count - 1,
+            )
+
     def _check(self, targets: np.ndarray[tuple[int], np.dtype[np.int32]]) -> None:
         """Raise SafetyStopError for the first thing that is not as it has to be."""
         self._check_user()
         self._check_lateness()
+        self._check_strangers()
         now = self._line.clock.now()
         for channel, target in zip(self._channels, targets.tolist(), strict=True):
             if not channel.is_fine(target, now):

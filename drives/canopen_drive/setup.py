@@ -6,7 +6,13 @@ from drives import objects
 from drives.canopen_drive.drive import CanopenDrive
 from drives.canopen_drive.torque_offset import TORQUE_OFFSET
 from drives.cia402 import Mode
-from drives.errors import DrivesError, NotSupportedError, SdoAbortError, SdoTimeoutError
+from drives.errors import (
+    DrivesError,
+    NotSupportedError,
+    SdoAbortError,
+    SdoError,
+    SdoTimeoutError,
+)
 from drives.objects import ObjectAddress, ObjectInfo, type_bits
 from drives.profile import UNKNOWN
 
@@ -71,7 +77,7 @@ class TemporaryObjects:
         while self._before:
             info, before, matters = self._before.pop()
             try:
-                self._drive.write(info, before)
+                self._write_surely(info, before)
             except SdoTimeoutError as error:
                 failures.append(str(error))
                 if self._before and not self._drive.answers():
@@ -85,6 +91,16 @@ class TemporaryObjects:
                 if matters:
                     failures.append(str(error))
         return failures
+
+    def _write_surely(self, info: ObjectInfo, value: float) -> None:
+        """Write; where the answer is missing or wrong, see what the drive holds, and try once more."""
+        try:
+            self._drive.write(info, value)
+        except SdoAbortError:
+            raise
+        except SdoError:
+            if self._drive.read_number(info) != value:
+                self._drive.write(info, value)
 
 
 def mode(drive: CanopenDrive, wanted: Mode, changes: TemporaryObjects) -> None:

@@ -17,6 +17,8 @@ _UPLOAD_BEGUN, _SEGMENT, _DOWNLOAD_BEGUN, _ABORTED = 2, 0, 3, 4
 """Command specifiers of an SDO server (CiA 301, clause 7.2.4.3)."""
 _TOGGLE = 0x10
 _STATUSWORD_BYTES = 2
+_FIRST = 5e-4
+"""s after which a stranger sends first."""
 
 Alteration = Literal[
     "other index",
@@ -158,7 +160,7 @@ class PdoMissing(PdoFault):
 class PdoLate(PdoFault):
     """It comes so many cycles late."""
 
-    cycles: float = 0.95
+    cycles: float = 1.3
 
     def instead(self, machine: "RunningMachine", cob_id: int, data: bytes) -> tuple[Sent, ...]:
         """Return it for later."""
@@ -261,7 +263,7 @@ class Stranger(Fault):
             machine.scheduler.add(self.period, send)
 
         machine.wire.to_nodes[self] = unchanged
-        machine.scheduler.add(0.4 * self.period, send)
+        machine.scheduler.add(min(_FIRST, self.period), send)
 
 
 def nmt_command(command: int, node_id: int) -> Callable[[int], Stranger]:

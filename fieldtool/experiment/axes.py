@@ -42,6 +42,9 @@ class Axes:
     resolution: FloatArray | None = None
     """One count of each axis' encoder, shape (M,), rad or m; None where it is fine enough."""
 
+    inertia: FloatArray | None = None
+    """Of each axis by the prior model, all its masses, shape (M,), kg m2 or kg; None: not known."""
+
     @property
     def counts(self) -> FloatArray:
         """One count of each encoder, shape (M,), rad or m; 0 where it was not given."""

@@ -15,6 +15,13 @@ from fieldtool.experiment.axes import (
     keep_whatever_happens,
     sample_times,
 )
+from fieldtool.experiment.plausible import (
+    BLIND_SPEED,
+    BLIND_TORQUE,
+    BLIND_WAY,
+    BlindPush,
+    inertia_of_move,
+)
 from fieldtool.experiment.stepped.plan import smooth_move
 from fieldtool.records.recording import Experiment
 
@@ -156,6 +163,10 @@ class _DirectionCheck:
         self._waited = self._still = 0
         self._still_rows = round(STILL_TIME / cycle_time)
         self._longest_wait = round(STILL_TIMEOUT / cycle_time)
+        self._cycle_time = cycle_time
+        self._blind: BlindPush | None = None
+        self._resting: list[float] = []
+        self._moves = False
 
     def __call__(self, before: Capture | None) -> FloatArray | None:
         """Return the next slice of targets; see ``drives.api.Source``."""
@@ -177,6 +188,7 @@ class _DirectionCheck:
         self._offset = np.clip(stands - self._start, -self._reach, self._reach)
 
     def _watch(self, capture: Capture) -> None:
+        self._watch_torque(capture)
         moved = capture.position[-1] - self._start
         pushed = not self._nudge and (self._waiting or self._done > self._rest)
         for j, name in enumerate(self._axes.names):
@@ -188,6 +200,41 @@ class _DirectionCheck:
                 self._stay(name, float(moved[j]), float(self._offset[j]), most, self._axes.unit(j))
         if self._waiting:
             self._wait(moved)
+
+    def _watch_torque(self, capture: Capture) -> None:
+        """Raise if the torque has taken the axis far, by the prior model, and its encoder shows none."""
+        axes, k = self._axes, self._k
+        if axes.inertia is None:
+            return
+        torque = capture.torque[:, k]
+        if self._waiting or self._done <= self._rest:
+            self._resting = [*self._resting, *torque.tolist()][-self._still_rows :]
+            return
+        moves = bool(np.ptp(capture.position_reference[:, k]) > 0)
+        if moves and not self._moves:
+            limits = axes.limits[k]
+            self._blind = BlindPush(
+                float(axes.inertia[k]),
+                self._cycle_time,
+                BLIND_SPEED * limits.velocity,
+                BLIND_WAY * (limits.travel[1] - limits.travel[0]),
+                float(self._slack[k]),
+                float(np.mean(self._resting)) if self._resting else 0.0,
+            )
+        self._moves = moves
+        if self._blind is None or (self._blind.moved and not moves):
+            return  # friction may hold it where it was told to stand
+        blind = self._blind.take(capture.position[:, k], torque)
+        if blind and abs(float(torque[-1])) > BLIND_TORQUE * axes.limits[k].torque:
+            unit = "N m" if axes.unit(k) == "rad" else "N"
+            raise SafetyStopError(
+                f"{axes.names[k]}: does not move by its encoder, while its torque has risen to "
+                f"{torque[-1]:.3g} {unit}, which would have taken it far by the prior model; its power "
+                "was cut and all axes were stopped. Does the encoder count, is the axis blocked or its "
+                "brake closed? If dry friction holds it, raise its gains position_p and velocity_p.",
+                axis=axes.names[k],
+                runaway=True,
+            )
 
     def _wait(self, moved: FloatArray) -> None:
         """End the wait when all axes have stood for long enough, wherever that is."""
@@ -260,6 +307,31 @@ class _DirectionCheck:
                 f"{name}: the torque that starts a positive move is negative; all axes were stopped. "
                 "Check the drive's polarity (0x607E).",
                 axis=name,
+            )
+        self._judge_inertia(capture)
+
+    def _judge_inertia(self, capture: Capture) -> None:
+        """Raise SafetyStopError if the torque is not one that moves the axis of the prior model."""
+        axes, k = self._axes, self._k
+        if axes.inertia is None:
+            return
+        rows = slice(self._waited, None)
+        found = inertia_of_move(
+            capture.position_reference[rows, k],
+            capture.position[rows, k],
+            capture.torque[rows, k],
+            self._cycle_time,
+        )
+        prior = float(axes.inertia[k])
+        factor = found.factor_off(prior)
+        if factor is not None:
+            unit = "kg m2" if axes.unit(k) == "rad" else "kg"
+            raise SafetyStopError(
+                f"{axes.names[k]}: by its torque this move shows {found.value:.3g} {unit}, the prior "
+                f"model has {prior:.3g} {unit} in all: a factor of {factor:.2g}. All axes were stopped. "
+                "Either the torque scale is wrong (rated torque 0x6076, torque constant, the drive "
+                "profile's units), or the machine profile's prior masses are; correct the one that is.",
+                axis=axes.names[k],
             )
 
 

@@ -20,7 +20,7 @@ from fieldtool.experiment.stepped.design import undamped_modes
 from fieldtool.identify.likelihood.expected import Noise
 from fieldtool.identify.multisine.pilot import read_pilot
 from fieldtool.records.recording import Experiment, Recording, RecordingWriter
-from fieldtool.workflow.models import prior_model
+from fieldtool.workflow.models import check_torque_scale, prior_model
 from fieldtool.workflow.planning import (
     PlannedFast,
     Timing,
@@ -205,6 +205,7 @@ class _Measurement:
         """Plan the main experiments with what the pilot found, and return what that is."""
         session = self._session
         found = read_pilot(recording, self._setting.model)
+        check_torque_scale(found.torque_ratio, self._setting.model)
         for note in found.notes:
             session.warn(note)
         modes = ", ".join(f"{w / (2 * np.pi):.2f}" for w in undamped_modes(found.model)[0])

@@ -20,7 +20,7 @@ from fieldtool.experiment.stepped.runner import run_plan
 from fieldtool.identify.classic import without_friction
 from fieldtool.identify.recorded import identify_recording
 from fieldtool.records.recording import Experiment, Recording, RecordingWriter
-from fieldtool.workflow.models import prior_model
+from fieldtool.workflow.models import check_believable, prior_model
 from fieldtool.workflow.preparation import axes_of, recording_header, setting_of, window_notes
 from fieldtool.workflow.session import Session
 from fieldtool.writeback.temporary import backed_up
@@ -70,6 +70,7 @@ def _measure_both_passes(session: Session, group: CanopenGroup) -> float:
         except IdentificationError as error:
             session.warn(f"The first pass alone can not be identified ({error})")
             return machine_time
+        check_believable(found.model, setting.model)
         modes = ", ".join(f"{w / (2 * np.pi):.2f}" for w in undamped_modes(found.model)[0])
         screen.say(f"Resonances found: {modes} Hz." if modes else "The axes are rigid.")
         now_known = replace(setting, model=without_friction(found.model))

@@ -7,8 +7,9 @@ import numpy as np
 
 from drives.errors import ProfileError
 from drives.profile import MachineProfile
-from fieldtool.errors import PlanRefusedError
-from fieldtool.records.model import AxisModel, Coupling, Estimate, MachineModel
+from fieldtool.errors import IdentificationError, PlanRefusedError
+from fieldtool.experiment.plausible import FAR_OFF
+from fieldtool.records.model import AxisModel, Coupling, Estimate, FloatArray, MachineModel
 from fieldtool.workflow.session import Options
 
 
@@ -37,6 +38,48 @@ def prior_model(machine: MachineProfile) -> MachineModel:
             "the couplings together are more than the last masses allow: make them smaller",
         )
     return model
+
+
+WHAT_MAY_BE_WRONG = (
+    "Either the torque scale is wrong (rated torque 0x6076, torque constant, drive profile), "
+    "or the machine profile's prior masses are. All axes are disabled, and the recording is kept. "
+    "Correct what is wrong, and measure again."
+)
+
+
+def check_torque_scale(ratios: FloatArray, prior: MachineModel) -> None:
+    """Refuse to go on where motion takes many times more or less torque than it did last time.
+
+    Raises
+    ------
+    IdentificationError
+        Naming the axis, the factor, and what may be wrong.
+    """
+    for axis, ratio in zip(prior.axes, ratios.tolist(), strict=True):
+        if not 1 / FAR_OFF < ratio < FAR_OFF:
+            raise IdentificationError(
+                f"{axis.name}: its motion in the pilot takes {ratio:.2g} times the torque that it takes "
+                f"by the prior model. {WHAT_MAY_BE_WRONG}"
+            )
+
+
+def check_believable(found: MachineModel, prior: MachineModel) -> None:
+    """Refuse to go on with a machine that is many times heavier or lighter than it was last time.
+
+    Raises
+    ------
+    IdentificationError
+        Naming the axis, both numbers, and what may be wrong.
+    """
+    for now, before in zip(found.axes, prior.axes, strict=True):
+        sums = [sum(mass.value for mass in axis.masses) for axis in (now, before)]
+        factor = sums[0] / sums[1]
+        if not 1 / FAR_OFF < factor < FAR_OFF:
+            unit = "kg m2" if now.kind == "rotary" else "kg"
+            raise IdentificationError(
+                f"{now.name}: its masses come to {sums[0]:.3g} {unit} in all, the prior model has "
+                f"{sums[1]:.3g} {unit}: a factor of {factor:.2g}. {WHAT_MAY_BE_WRONG}"
+            )
 
 
 def truth_model(machine: MachineProfile) -> MachineModel | None:

@@ -109,4 +109,5 @@ def axes_of(group: CanopenGroup, setting: Setting) -> Axes:
     """Return what the runners have to know of the axes."""
     units = tuple(drive.position_unit for drive in group.drives)
     resolution = np.array([drive.scaling.position for drive in group.drives])
-    return Axes(group.axes, setting.limits, setting.centre, units, resolution)
+    inertia = np.array([sum(m.value for m in axis.masses) for axis in setting.model.axes])
+    return Axes(group.axes, setting.limits, setting.centre, units, resolution, inertia)

@@ -32,7 +32,12 @@ from fieldtool.report.pictures import draw_responses
 from fieldtool.workflow.criticising import criticised
 from fieldtool.workflow.fast_measuring import measured_fast
 from fieldtool.workflow.measuring import measured
-from fieldtool.workflow.models import data_sheet_masses, prior_model, truth_model
+from fieldtool.workflow.models import (
+    check_believable,
+    data_sheet_masses,
+    prior_model,
+    truth_model,
+)
 from fieldtool.workflow.session import (
     Options,
     Quiet,
@@ -321,6 +326,7 @@ def _identify(session: Session, options: Options) -> Identified:
     for note in (*identified.notes, *_against_data_sheet(session, identified.model)):
         session.warn(note)
     _keep(session.folder, identified, prior_model(machine))
+    check_believable(identified.model, prior_model(machine))
     return identified
 
 

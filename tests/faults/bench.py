@@ -6,6 +6,7 @@ the tool is replaced: a case is a command as a user gives it.
 
 import contextlib
 import io
+import os
 import re
 import struct
 import sys
@@ -16,6 +17,7 @@ from enum import Enum
 from itertools import count
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import yaml
 
@@ -147,9 +149,13 @@ class Bench:
         self.machine.receive = self._seen  # type: ignore[method-assign]
 
     def __enter__(self) -> "Bench":
+        notes = str(self.folder / "notes")
+        self._apart = patch.dict(os.environ, {"FIELDTOOL_STATE_DIR": notes})
+        self._apart.start()
         return self
 
     def __exit__(self, *_: object) -> None:
+        self._apart.stop()
         unregister(self.channel)
 
     @property
@@ -222,14 +228,7 @@ class Bench:
     def run(self) -> Result:
         """Run the command that the moment belongs to, let time pass, and see what there is."""
         if self.moment is Moment.WRITE:
-            self.out.mkdir()
-            (self.out / "machine.yaml").write_text(self.profile.read_text(), encoding="utf-8")
-            axes = [
-                {"axis": a, "parameters": TUNING, "sensitivity_peak": 1.4, "reason": "bench"}
-                for a in NAMES.values()
-            ]
-            tuning = {"format": "fieldtool-tuning/1", "axes": axes}
-            (self.out / "tuning.yaml").write_text(yaml.safe_dump(tuning), encoding="utf-8")
+            self.prepare_write()
             code, said = command("write", self.out, "--yes", "--store")
         else:
             code, said = command("measure", self.profile, "--yes", "--out", self.out)
@@ -238,6 +237,17 @@ class Bench:
         ended = self.machine.time
         self.machine.advance_to(ended + round(PATIENCE * 1e9))
         return self._result(code, said)
+
+    def prepare_write(self) -> None:
+        """Make a session folder with a tuning for both axes."""
+        self.out.mkdir()
+        (self.out / "machine.yaml").write_text(self.profile.read_text(), encoding="utf-8")
+        axes = [
+            {"axis": a, "parameters": TUNING, "sensitivity_peak": 1.4, "reason": "bench"}
+            for a in NAMES.values()
+        ]
+        tuning = {"format": "fieldtool-tuning/1", "axes": axes}
+        (self.out / "tuning.yaml").write_text(yaml.safe_dump(tuning), encoding="utf-8")
 
     def _result(self, code: int, said: str) -> Result:
         rows, complete = self._recorded()

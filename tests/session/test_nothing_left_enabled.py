@@ -145,31 +145,54 @@ def test_another_master_on_the_bus_is_refused(bench, cob_id, data, said):
     assert bench.powered() == {}
 
 
-def test_a_sync_that_is_not_ours_spoils_its_rows(bench):
+FOREIGN = [
+    (0x080, b"", "a SYNC"),
+    (0x200 + TABLE, bytes(8), r"targets \(a PDO\) for table"),
+    (0x77F, b"\x05", "the host's own heartbeat"),
+    (0x000, b"\x81\x00", r"the NMT command reset \(0x81\) to all nodes"),
+    (0x600 + ARM, bytes.fromhex("2B40600000000000"), "a write to object 0x6040:00 of arm"),
+]
+HARMLESS = [
+    (0x100, bytes(6)),
+    (0x000, b"\x81\x55"),
+    (0x600 + ARM, bytes.fromhex("4041600000000000")),
+    (0x200 + 99, bytes(8)),
+    (0x5FF, bytes(8)),
+]
+
+
+@pytest.mark.parametrize(("cob_id", "data", "said"), FOREIGN)
+def test_a_command_that_is_not_ours_stops_every_axis(bench, cob_id, data, said):
+    with pytest.raises(SafetyStopError, match=f"somebody else sends {said} on this bus"):
+        motion_with(bench, [(cob_id, data)])
+    assert bench.powered() == {}
+
+
+def test_frames_that_command_nothing_are_passed_over(bench):
+    """Time stamps, commands to other nodes, somebody who reads an object."""
+    capture = motion_with(bench, HARMLESS)
+    assert capture.missing == ()
+    assert bench.powered() == {}
+
+
+def motion_with(bench, frames):
+    """Hold the position, block by block, with a frame of somebody else's in each."""
     other = can.Bus(interface="fieldsim", channel=bench.channel)
+    left = list(frames)
     try:
         with bench.connected() as group, group.motion(0.002) as motion:
-            position = motion.position
 
             def source(before):
-                if before is not None:
+                if before is not None and not left:
                     return None
-                return np.tile(position, (60, 1))
+                if before is not None:
+                    cob_id, data = left.pop(0)
+                    other.send(can.Message(arbitration_id=cob_id, data=data, is_extended_id=False))
+                return np.tile(motion.position, (10, 1))
 
-            clean = motion.stream(source)
-            assert clean.missing == ()
-            blocks = 0
-
-            def disturbed(before):
-                nonlocal blocks
-                blocks += 1
-                other.send(can.Message(arbitration_id=0x80, is_extended_id=False))
-                return np.tile(position, (10, 1)) if blocks < 4 else None
-
-            capture = motion.stream(disturbed)
+            return motion.stream(source)
     finally:
         other.shutdown()
-    assert capture.missing
 
 
 def test_short_emergencies_and_empty_heartbeats_do_no_harm(bench):

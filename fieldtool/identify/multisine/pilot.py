@@ -46,6 +46,8 @@ FRICTION_TAKEN = 2.0
 with it hides a part of it, and the rest stands out more from one fit to the next."""
 FRICTION_SETTLED = 0.02
 """Relative change of the friction from one fit to the next, below which no other follows."""
+IN_PHASE = 0.7
+"""Share of the torque that has to be in phase with what the prior model expects."""
 FRICTION_SEEN = 5.0
 """Standard errors from which dry friction counts as seen."""
 
@@ -61,6 +63,8 @@ class PilotFindings:
     friction: DryFriction | None
     """None where the model does not explain the pilot."""
     notes: tuple[str, ...]
+    torque_ratio: FloatArray
+    """Torque that each axis' motion took, over what it takes by the machine as last accepted, (M,)."""
 
 
 def read_pilot(recording: Recording, prior: MachineModel) -> PilotFindings:
@@ -86,10 +90,11 @@ def read_pilot(recording: Recording, prior: MachineModel) -> PilotFindings:
     phasors = tuple(one.phasors(recording.names) for one in lines)
     step = recording.sample_period
     notes: list[str] = []
+    ratios = _torque_ratios(phasors, prior)
     explained = _explained(phasors, experiments, step, prior, notes)
     if explained is None:
         noise = _noise(phasors, experiments, step, prior, np.zeros(len(prior.axes)))
-        return PilotFindings(prior, noise, None, tuple(notes))
+        return PilotFindings(prior, noise, None, tuple(notes), ratios)
     fitted, friction = explained
     records = WholeRecords.of(recording, lines, friction)
     if records.too_long:
@@ -103,7 +108,24 @@ def read_pilot(recording: Recording, prior: MachineModel) -> PilotFindings:
             f"{friction.axes[k]}: dry friction of {one.value:.2g} +- {1.96 * one.std:.1g} {unit}, "
             f"{100 * friction.share[k]:.0f} % of the pilot's torque."
         )
-    return PilotFindings(fitted.model, noise, friction, tuple(notes))
+    return PilotFindings(fitted.model, noise, friction, tuple(notes), ratios)
+
+
+def _torque_ratios(phasors: Sequence[Phasors], prior: MachineModel) -> FloatArray:
+    """Return the median over all lines of measured over expected torque, shape (M,).
+
+    Only the part in phase with what is expected counts: friction is a quarter period beside it.  Where
+    that part is not most of it, the machine is another one, and no scale can be told: then 1.
+    """
+    along, sizes = [], []
+    for one in phasors:
+        response = machine_response(prior, 2 * np.pi * one.frequencies)
+        expected = np.linalg.solve(response, one.position[:, :, None])[:, :, 0]
+        size = np.maximum(np.abs(expected), 1e-300)
+        along.append((one.torque * expected.conj()).real / size**2)
+        sizes.append(np.abs(one.torque) / size)
+    ratios: FloatArray = np.median(np.vstack(along), axis=0)
+    return np.where(ratios > IN_PHASE * np.median(np.vstack(sizes), axis=0), ratios, 1.0)
 
 
 def _explained(

@@ -1,0 +1,132 @@
+"""SDO transfers that believe only the answers that belong to them.
+
+python ``canopen`` takes the next answer for the one it waits for: a write is confirmed by an answer
+about another object, and one that came too late for its own request answers the next.  Here an answer
+has to fit its request (CiA 301, clause 7.2.4.3): command specifier, index and sub-index, toggle bit,
+eight bytes.  What does not fit is passed over and remembered, for the error if nothing else comes.
+"""
+
+import struct
+
+from canopen.sdo import SdoAbortedError, SdoClient, SdoCommunicationError
+
+SDO_TIMEOUT = 0.5
+"""Seconds a drive may take for an ordinary SDO answer."""
+SDO_BYTES = 8
+LONGEST = 1_000_000
+"""Most bytes of one object that are read: no drive has more, and a defective one never ends."""
+MOST_STRANGE = 1000
+"""Most answers that are passed over while one is waited for."""
+
+_DOWNLOAD_SEGMENT, _DOWNLOAD, _UPLOAD, _UPLOAD_SEGMENT, _ABORT = 0, 1, 2, 3, 4
+_ANSWER_TO = {_DOWNLOAD_SEGMENT: 1, _DOWNLOAD: 3, _UPLOAD: 2, _UPLOAD_SEGMENT: 0}
+"""Server's command specifier by the client's."""
+_TOGGLE = 0x10
+
+
+class StrictSdoClient(SdoClient):  # type: ignore[misc]
+    """``canopen``'s SDO client, which receives by itself while it waits, and checks what it gets."""
+
+    RESPONSE_TIMEOUT = SDO_TIMEOUT
+    _place = bytes(3)
+    """Index and sub-index of the transfer, as they are sent."""
+    _segments = 0
+    _owed = 0
+    """Answers that did not come in time, and may still come."""
+    unasked = 0
+    """Answers to nothing: more than were asked for."""
+    contradicted = ""
+    """About which object two answers came that differ; then nothing that the node says is known."""
+    _last = b""
+
+    def request_response(self, sdo_request: bytes) -> bytes:
+        """Send a request, and return the answer that fits it.
+
+        Raises
+        ------
+        SdoAbortedError
+            If the drive aborts the transfer.
+        SdoCommunicationError
+            If no answer fits in time, or a transfer does not end.
+        """
+        self.forget_old()
+        if self.contradicted:
+            raise SdoCommunicationError(
+                f"two answers came about {self.contradicted} that differ: two drives have this node id, "
+                "or somebody else answers for it"
+            )
+        specifier = sdo_request[0] >> 5
+        if specifier in (_DOWNLOAD, _UPLOAD):
+            self._place, self._segments = bytes(sdo_request[1:4]), 0
+        else:
+            self._segments += 1
+        if self._segments * 7 > LONGEST:
+            self.abort(0x05040005)
+            raise SdoCommunicationError(f"it has more than {LONGEST} bytes, and does not end")
+        self.send_request(sdo_request)
+        return self._answer(bytes(sdo_request))
+
+    def forget_old(self) -> None:
+        """Take note of answers that nobody waited for, and drop them."""
+        while not self.responses.empty():
+            answer = bytes(self.responses.get_nowait())
+            if self._owed:
+                self._owed -= 1
+                continue
+            self.unasked += 1
+            if answer[:4] == self._last[:4] and answer != self._last:
+                self.contradicted = _place(answer)
+
+    def _answer(self, request: bytes) -> bytes:
+        strange: list[bytes] = []
+        clock = self.network.clock
+        deadline = clock.now() + self.RESPONSE_TIMEOUT
+        while len(strange) < MOST_STRANGE:
+            left = deadline - clock.now()
+            if not self.network.wait(max(0.0, left), lambda: not self.responses.empty()):
+                break
+            answer = bytes(self.responses.get_nowait())
+            if self._fits(request, answer):
+                if answer[0] >> 5 == _ABORT:
+                    raise SdoAbortedError(struct.unpack_from("<L", answer, 4)[0])
+                self._last = answer
+                return answer
+            strange.append(answer)
+        self.abort(0x05040000)
+        if not strange:
+            self._owed += 1
+            raise SdoCommunicationError("No SDO response received")
+        raise SdoCommunicationError(f"{_in_words(strange[0], request)}; no right one came")
+
+    def _fits(self, request: bytes, answer: bytes) -> bool:
+        if len(answer) != SDO_BYTES:
+            return False
+        asked, given = request[0] >> 5, answer[0] >> 5
+        if given == _ABORT:
+            return answer[1:4] in (self._place, bytes(3))
+        if given != _ANSWER_TO.get(asked):
+            return False
+        if asked in (_DOWNLOAD, _UPLOAD):
+            return answer[1:4] == self._place
+        return not (request[0] ^ answer[0]) & _TOGGLE
+
+    def abort(self, abort_code: int = 0x08000000) -> None:
+        """Tell the drive that the transfer is over."""
+        self.send_request(struct.pack("<B3sL", 0x80, self._place, abort_code))
+
+
+def _in_words(answer: bytes, request: bytes) -> str:
+    """Return what is wrong with an answer."""
+    if len(answer) != SDO_BYTES:
+        return f"it has {len(answer)} bytes in place of {SDO_BYTES}"
+    given = answer[0] >> 5
+    if given != _ANSWER_TO.get(request[0] >> 5) and given != _ABORT:
+        return f"its command specifier is {given} (0x{answer[0]:02X})"
+    if request[0] >> 5 in (_DOWNLOAD, _UPLOAD) or given == _ABORT:
+        return f"it is about {_place(answer)}"
+    return "its toggle bit does not alternate"
+
+
+def _place(answer: bytes) -> str:
+    """Return the object that an answer is about."""
+    return f"0x{int.from_bytes(answer[1:3], 'little'):04X}:{answer[3]:02X}"

@@ -1,0 +1,55 @@
+"""Every fault at every moment, and what came of it: ``python -m tests.benchmarks faults``.
+
+Run by itself it takes words of faults' names, and ``@`` with words of moments' names.
+
+Exit code, cycles until all drives that were under power had left operation enabled, time until the
+last power stage was off, how far a motor went, rows kept on the disk, and what was said.
+"""
+
+import sys
+import textwrap
+import time
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
+from tests.faults.bench import Moment
+from tests.faults.table import ROWS, problems, try_row
+
+MOMENTS = [word[1:] for word in sys.argv[1:] if word.startswith("@")]
+
+
+def main() -> int:
+    words = [word for word in sys.argv[1:] if not word.startswith("@")]
+    moments = [m for m in Moment if not MOMENTS or any(word in m.value for word in MOMENTS)]
+    wrong = cases = 0
+    began = time.process_time()
+    print(
+        f"{'fault':36}{'moment':18}{'code':>5}{'cycles':>8}{'off s':>8}{'rad':>7}{'rows':>6}  outcome"
+    )
+    for row in ROWS:
+        if words and not any(word in row.name for word in words):
+            continue
+        for moment in moments:
+            result, expected = try_row(row, moment), row.expected(moment)
+            found = problems(result, expected, moment)
+            cases += 1
+            wrong += bool(found)
+            watch = result.watch
+            acted = bool(watch.powered_then) and result.code and not expected.whole
+            cycles = f"{result.cycles():8.1f}" if acted else f"{'':>8}"
+            off = f"{max(watch.off.values()):8.3f}" if acted and watch.off else f"{'':>8}"
+            far = max(watch.farthest.values(), default=0.0)
+            said = result.said.split("fieldtool: ", 1)[-1] if result.code else expected.why
+            print(
+                f"{row.name:36}{moment.value:18}{result.code:5}{cycles}{off}{far:7.2f}"
+                f"{sum(result.rows):6}  {'WRONG: ' + '; '.join(found) if found else 'ok'}"
+            )
+            print(textwrap.indent(textwrap.shorten(said, 220), "    "))
+    seconds = time.process_time() - began
+    print(f"{cases} cases, {wrong} not as they have to be, {seconds:.0f} s of CPU")
+    return wrong
+
+
+if __name__ == "__main__":
+    sys.exit(min(main(), 1))
