@@ -23,7 +23,8 @@ from fieldtool.criticise.numbers import numbers_of
 from fieldtool.criticise.search.afterwards import Accepted
 from fieldtool.criticise.search.fit import Fitted
 from fieldtool.criticise.search.judge import Parts
-from fieldtool.criticise.search.prepare import prepare
+from fieldtool.criticise.search.machine import Machine
+from fieldtool.criticise.search.prepare import Prepared, prepare
 from fieldtool.criticise.search.search import Advance, Found, search
 from fieldtool.criticise.simulate.structure import Structure
 from fieldtool.criticise.tell_apart import experiment_for
@@ -90,7 +91,7 @@ def criticise(
         If nothing can be compared, or the model is of other axes.
     """
     prepared = prepare(recording, _bare(model, prior), contiguous)
-    found = search(prepared, without, advance)
+    found = search(prepared, without, advance, _accepted_base(prepared, model, prior))
     prepared = found.prepared
     before = _axis_errors(found, found.before)
     after = _axis_errors(found, found.after)
@@ -129,13 +130,30 @@ def _bare(model: MachineModel, prior: MachineModel | None) -> MachineModel:
     axes = []
     for axis, accepted in zip(model.axes, prior.axes, strict=True):
         known = {
-            name: getattr(axis if getattr(accepted, name).value != 0.0 else accepted, name)
+            name: accepted_one
+            if accepted_one.value == 0.0 or getattr(axis, name).value == 0.0
+            else getattr(axis, name)
             for name in ("viscous_friction", "load_friction")
+            for accepted_one in [getattr(accepted, name)]
         }
         axes.append(replace(axis, **known))
-    held = {frozenset(c.axes) for c in prior.couplings if c.value != 0.0}
-    couplings = tuple(c for c in model.couplings if frozenset(c.axes) in held)
+    found = {frozenset(c.axes): c for c in model.couplings}
+    couplings = tuple(found.get(frozenset(c.axes), c) for c in prior.couplings if c.value != 0.0)
     return replace(model, axes=tuple(axes), couplings=couplings, effects=())
+
+
+def _accepted_base(
+    prepared: Prepared, model: MachineModel, prior: MachineModel | None
+) -> FloatArray | None:
+    """Return the accepted machine's numbers in the order of those that are fitted, if they are alike."""
+    if prior is None or prior.names != model.names:
+        return None
+    machine = prepared.start.machine
+    accepted = Machine.of(_bare(prior, prior), np.ones(len(prior.axes)))
+    values = {v.name: v.value for v in accepted.variables}
+    if set(values) != set(machine.names):
+        return None
+    return np.array([values[name] for name in machine.names])
 
 
 def _all_parts(found: Found, fitted: Fitted) -> Parts:

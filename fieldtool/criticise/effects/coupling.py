@@ -17,7 +17,6 @@ class CouplingSpring(Effect):
     source = "linear elasticity between two bodies; Hovland, Berglund, Hanssen (chains of masses)"
     signature = "torque of one axis that goes with the other's position, strongest at low frequency"
     contrary = "growth with the square of the frequency"
-    shows = ("other axes", "own motion")
 
     def structure(self, structure: Structure, values: Values) -> Structure:
         """Add to the stiffness."""
@@ -35,7 +34,6 @@ class CouplingInertia(Effect):
     source = "Hovland, Berglund, Hanssen, equation 10 (off-diagonal masses)"
     signature = "torque of one axis that goes with the other's acceleration"
     contrary = "a part that goes with the other's position"
-    shows = ("other axes",)
 
     def structure(self, structure: Structure, values: Values) -> Structure:
         """Add to the mass matrix."""

@@ -13,6 +13,8 @@ FINEST = 6
 """Orders tried per reciprocal of the travel."""
 FEWEST_WAVES = 1.5
 """Waves within the travel from which an order can be told."""
+FEW_WAVES = (0.5, 0.75, 1.0)
+"""Waves within the travel that are tried besides, where gravity could be meant as well."""
 MOST_ORDERS = 4000
 BINS = 8
 """Bins of the position per wave of the highest order."""
@@ -123,8 +125,12 @@ def position_candidates(context: Context) -> list[Effect]:
             (Cogging, unit, 5 * size),
             (EncoderError, info.position_unit, 0.02 * travel),
         ):
-            for order in waves(context, axis, kind is EncoderError):
-                low, high = 0.9 * order, 1.1 * order
+            orders = waves(context, axis, kind is EncoderError)
+            if info.kind == "rotary":
+                orders = [*orders, *(o for w in FEW_WAVES if (o := 2 * np.pi * w / travel) > 1.5)]
+            for order in orders:
+                low, high = (0.9, 1.1) if order * travel > 2 * np.pi * FEWEST_WAVES else (0.6, 1.6)
+                low, high = low * order, high * order
                 number = Parameter("order", per, order, low, high, 0.1 * 2 * np.pi / travel)
                 pair = (wave("sine", most, length), wave("cosine", most, length))
                 out.append(kind(axis, (*pair, number)))

@@ -30,7 +30,6 @@ class TorqueScale(Effect):
     source = "torque constant of the motor; Krause, Analysis of Electric Machinery, 2002"
     signature = "all of an axis' masses, springs and dampers off by one factor, its neighbours' not"
     contrary = "one mass or spring alone that is off"
-    shows = ("own motion", "other axes")
 
     def reported(self, torque: FloatArray, motion: Motion, values: Values) -> FloatArray:
         """Divide by the scale."""
@@ -110,7 +109,6 @@ class PeriodicDisturbance(Effect):
     source = "a neighbour's drive, a pump, the mains; Bodson, Adaptive Algorithms, 2005"
     signature = "one line of the spectrum at the same frequency in all experiments"
     contrary = "a frequency that goes with the speed or the period of the excitation"
-    shows = ("one frequency",)
 
     def unknown(self, motion: Motion, values: Values) -> tuple[FloatArray, ...]:
         """Return sine and cosine, of unknown size."""
@@ -175,12 +173,24 @@ def disturbance_candidates(context: Context) -> list[Effect]:
             level = np.minimum(level, np.interp(grid[inside], frequency, ratio))
         for k in np.argsort(level)[::-1][:2]:
             if level[k] > STANDS_OUT:
-                f = float(grid[inside][k])
+                f = _between_lines(longest.torque.shape[0], context, longest, axis, grid[inside][k])
                 number = Parameter(
-                    "frequency", "Hz", f, f - 0.5 * width, f + 0.5 * width, 0.1 * width
+                    "frequency", "Hz", f, f - 1.5 * width, f + 1.5 * width, 0.1 * width
                 )
                 out.append(PeriodicDisturbance(axis, (number,)))
     return out
+
+
+def _between_lines(rows: int, context: Context, longest: Motion, axis: int, peak: float) -> float:
+    """Return where between two lines a peak lies, from a parabola through the logarithms."""
+    error = context.errors[context.motions.index(longest)][:, axis]
+    power = np.log(np.abs(np.fft.rfft(error * np.hanning(rows))) ** 2 + 1e-300)
+    spacing = 1.0 / (rows * longest.step)
+    k = int(np.clip(round(peak / spacing), 2, power.size - 3))
+    k += int(np.argmax(power[k - 1 : k + 2])) - 1
+    bend = power[k - 1] - 2 * power[k] + power[k + 1]
+    shift = 0.5 * (power[k - 1] - power[k + 1]) / bend if bend < 0 else 0.0
+    return float((k + np.clip(shift, -0.5, 0.5)) * spacing)
 
 
 def _shifted(values: FloatArray, axis: int, shift: float) -> FloatArray:

@@ -10,8 +10,8 @@ from fieldtool.records.model import Estimate, MachineModel
 FloatArray = NDArray[np.float64]
 LIGHT = 0.01
 """Damping ratio that scales a damper whose value is zero."""
-OFFSET = 0.01
-"""Of the largest torque: how far the zero of a torque measurement is commonly off."""
+OFFSET = 0.003
+"""Of the largest torque: how far the zero of a torque measurement may be off without a word."""
 KNOWN = 1.0
 """Relative standard error of what is known of each other number beforehand: its size."""
 SMALLEST = 0.05

@@ -16,6 +16,8 @@ LEAST_TORQUE = 1e-3
 """RMS of what a cause explains over that of the torque, below which it does not matter."""
 BEYOND_NOISE = 1.5
 """Power of an axis' error over the noise, from which there is something to explain."""
+LEAST_SHARE_MORE = 0.4
+"""The same for a further cause on an axis that has one: the form of the first may be wrong."""
 RELATED = 0.1
 """A further effect of a family explains at least this of what the first one explained (RMS)."""
 KNOWN_WELL = 0.33
@@ -29,6 +31,8 @@ FAMILIES = (
     frozenset({"measurement_delay", "torque_lag"}),
     frozenset({"cogging", "encoder_error", "gravity"}),
 )  # fmt: skip
+FREE_OF_BOUNDS = ("presliding", "rounding", "frequency", "time")
+"""Numbers whose bounds are where the search begins, not what is physical."""
 STRENGTH = {
     "viscous_friction": ("coefficient",),
     "coulomb_friction": ("torque",),
@@ -81,7 +85,7 @@ class Tried:
         return len(keys) - 1 - keys[::-1].index(self.effect.key)
 
 
-def why_not(tried: Tried, context: Context, known_noise: bool, level: float) -> str:
+def why_not(tried: Tried, context: Context, known_noise: bool, level: float, further: bool) -> str:
     """Return why a candidate gets no name, in words; empty if it may have one.
 
     Parameters
@@ -92,12 +96,16 @@ def why_not(tried: Tried, context: Context, known_noise: bool, level: float) -> 
         Whether the noise is known from repeated periods.
     level : float
         RMS over that of the torque of what related effects explain already.
+    further : bool
+        Whether the axis has a cause already.
     """
     if tried.gain.p > CHANCE:
         return "explains no more of the unseen data than chance would"
     if tried.beyond < BEYOND_NOISE:
         return "there is nothing beyond the noise that it could explain"
-    least = LEAST_SHARE_KNOWN if known_noise else LEAST_SHARE
+    least = LEAST_SHARE
+    if known_noise:
+        least = LEAST_SHARE_MORE if further else LEAST_SHARE_KNOWN
     if tried.share < least:
         return f"explains only {100 * tried.share:.1f} % of what is left on unseen data"
     if tried.torque < LEAST_TORQUE:
@@ -111,7 +119,7 @@ def _unphysical(tried: Tried, context: Context) -> str:
     effect, values = tried.effect, tried.fitted.hypothesis.values[tried.place]
     numbers = tried.fitted.of_effect(tried.place)
     for p in effect.parameters:
-        if p.scale <= 0.0 or p.name in ("presliding", "rounding"):
+        if p.scale <= 0.0 or (p.name in FREE_OF_BOUNDS and effect.name != "extra_mode"):
             continue
         close = 1e-6 * max(abs(p.high - p.low), 1e-300)
         at_zero = p.low == 0.0 and values[p.name] <= close

@@ -24,6 +24,11 @@ PAIRED = 3
 """Candidates of which all pairs are fitted where none does alone."""
 ROUNDS = 6
 """Most causes."""
+SCREENING = 0.4
+"""Share of the time of a round."""
+MOST_TURNS = 6
+SETTLED = 1e-3
+"""Change of a number of the machine over its size, from which fit and noise are found anew."""
 TRACE = 0.01
 """Share of the error that a candidate must be expected to explain to be fitted in full."""
 Advance = Callable[[str, float], None]
@@ -46,7 +51,10 @@ class Found:
 
 
 def search(
-    prepared: Prepared, without: frozenset[str] = frozenset(), advance: Advance = lambda *_: None
+    prepared: Prepared,
+    without: frozenset[str] = frozenset(),
+    advance: Advance = lambda *_: None,
+    accepted_base: FloatArray | None = None,
 ) -> Found:
     """Find causes of what the machine's chains do not explain.
 
@@ -57,15 +65,22 @@ def search(
         Names of effects that are not tried.
     advance : callable
         Told what is done, and a number from 0 to 1.
+    accepted_base : ndarray, optional
+        The machine's numbers as last accepted: where an effect bent what was identified, the first
+        cause is looked for from there, too.
     """
     advance("fit the machine without effects", 0.0)
-    before = fit(prepared.simulator, prepared.start)
-    prepared = reweighted(prepared, before.hypothesis)
-    before = fit(prepared.simulator, before.hypothesis)
+    prepared, before = settled(prepared, prepared.start)
+    starts = [before.hypothesis]
+    if accepted_base is not None:
+        starts.append(replace(prepared.start, base=accepted_base))
     current, accepted = before, list[Accepted]()
     rejected: Reasons = {}
     for turn in range(ROUNDS):
-        found, seen = _round(prepared, current, accepted, without, turn, rejected, advance)
+        found, seen = _round(
+            prepared, current, accepted, without, turn, rejected, advance,
+            starts if turn == 0 else [current.hypothesis],
+        )  # fmt: skip
         for effect in seen:
             rejected.setdefault(effect.key, (effect, "leaves no trace of what it must leave"))
         if not found:
@@ -94,6 +109,19 @@ def search(
     )
 
 
+def settled(prepared: Prepared, start: Hypothesis) -> tuple[Prepared, Fitted]:
+    """Fit and find the noise in turn, until the machine's numbers stay."""
+    fitted = fit(prepared.simulator, start)
+    for _ in range(MOST_TURNS):
+        prepared = reweighted(prepared, fitted.hypothesis)
+        before, fitted = fitted, fit(prepared.simulator, fitted.hypothesis)
+        scales = fitted.hypothesis.machine.scales
+        moved = np.abs(fitted.hypothesis.base - before.hypothesis.base) / scales
+        if moved.max() < SETTLED:
+            break
+    return prepared, fitted
+
+
 def _on_all_rows(prepared: Prepared, current: Fitted) -> Fitted:
     lines = tuple(
         replace(one, span=replace(one.span, role="fit")) for one in prepared.simulator.lines
@@ -109,6 +137,7 @@ def _round(
     turn: int,
     rejected: Reasons,
     advance: Advance,
+    starts: Sequence[Hypothesis],
 ) -> tuple[list[Accepted], list[Effect]]:
     """Try everything once on top of what is accepted; return what is found and what was looked at."""
     simulator = prepared.simulator
@@ -122,31 +151,42 @@ def _round(
     if not active:
         return [], []
     context = prepared.context(current.hypothesis)
-    pool = [e for e in candidates(context, without) if {e.axis, e.other} & active]
     what = f"look for cause {len(accepted) + 1}"
 
     def step(share: float) -> None:
         advance(what, 0.9 * (turn + share) / ROUNDS)
 
-    at = tangent(simulator, current.hypothesis)
-    ranked = screened(simulator, at, pool, lambda s: step(0.4 * s))
-    chosen = _chosen(ranked, at)
-    tried: list[Tried] = []
-    for k, one in enumerate(chosen):
-        step(0.4 + 0.6 * k / len(chosen))
-        grown = _grown(current.hypothesis, one)
-        fitted = fit(simulator, grown, shared=at.of_machine)
-        tried.append(judged(simulator, fitted, one.effect, unseen))
+    best: dict[object, Tried] = {}
+    looked: list[Effect] = []
+    chosen: list[Screened] = []
+    for number, start in enumerate(starts):
+        pool = candidates(prepared.context(start), without)
+        pool = [e for e in pool if {e.axis, e.other} & active]
+        at = tangent(simulator, start)
+        ranked = screened(simulator, at, pool, _part(step, number, len(starts)))
+        chosen = _chosen(ranked, at)
+        looked += [s.effect for s in ranked]
+        for k, one in enumerate(chosen):
+            step((number + SCREENING + (1 - SCREENING) * k / len(chosen)) / len(starts))
+            fitted = fit(simulator, _grown(start, one), shared=at.of_machine)
+            key = one.effect.key
+            if key not in best or fitted.cost < best[key].fitted.cost:
+                best[key] = judged(simulator, fitted, one.effect, unseen)
+    tried = list(best.values())
     good = []
     for candidate in tried:
         why = _why_not(prepared, context, accepted, candidate)
         rejected[candidate.effect.key] = (candidate.effect, why)
         if not why:
             good.append(candidate)
-    looked = [s.effect for s in ranked]
     if good:
         return [_winner(simulator, good, rejected)], looked
     return _pair(prepared, context, current, accepted, at, chosen[:PAIRED], unseen), looked
+
+
+def _part(step: Callable[[float], None], number: int, starts: int) -> Callable[[float], None]:
+    """Return what is told of the screening from one start."""
+    return lambda share: step((number + SCREENING * share) / starts)
 
 
 def _why_not(
@@ -162,7 +202,8 @@ def _why_not(
         ),
         default=0.0,
     )
-    return why_not(candidate, context, known, level)
+    further = any(a.tried.effect.axis == candidate.effect.axis for a in accepted)
+    return why_not(candidate, context, known, level, further)
 
 
 def _chosen(ranked: Sequence[Screened], at: Tangent) -> list[Screened]:
