@@ -11,13 +11,15 @@ from fieldtool.criticise.effects.base import Effect
 from fieldtool.criticise.evidence.lines import Lines, flat
 from fieldtool.criticise.evidence.spans import Role
 from fieldtool.criticise.search.machine import Machine
-from fieldtool.criticise.simulate.inverse import needed_torque
+from fieldtool.criticise.simulate.inverse import HiddenSystem, needed_torque
 from fieldtool.criticise.simulate.motion import Motion
 from fieldtool.criticise.simulate.structure import Structure
 
 FloatArray = NDArray[np.float64]
 KEPT = 48
 """Simulations of the chains that are remembered."""
+THINNED = 3
+"""Every so many rows count where the first state of the hidden masses is found."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +84,8 @@ class Simulator:
 
     def __post_init__(self) -> None:
         self._kept: dict[bytes, FloatArray] = {}
+        self._free_key = b""
+        self._free_courses: FloatArray = np.zeros((0, 0, 0))
 
     def errors(self, hypothesis: Hypothesis) -> dict[str, FloatArray]:
         """Return the torque measured less simulated, (n, M), by experiment."""
@@ -138,8 +142,36 @@ class Simulator:
         if key not in self._kept:
             while len(self._kept) >= KEPT:
                 self._kept.pop(next(iter(self._kept)))
-            self._kept[key] = needed_torque(structure, motion)
+            self._kept[key] = self._less_free_motion(structure, motion)
         return self._kept[key]
+
+    def _less_free_motion(self, structure: Structure, motion: Motion) -> FloatArray:
+        """Return the needed torque from the hidden masses' first state that suits the data best.
+
+        The first state is not measured; a wrong one rings on at the structure's own frequencies.
+        """
+        needed = needed_torque(structure, motion)
+        if not structure.hidden.size:
+            return needed
+        courses = self._free_motions(structure, motion.step)[:, : motion.rows]
+        counted = motion.counted[::THINNED]
+        columns = (courses[:, ::THINNED] * counted).reshape(courses.shape[0], -1).T
+        side = ((motion.torque - needed)[::THINNED] * counted).ravel()
+        size = np.linalg.norm(columns, axis=0)
+        size[size == 0.0] = 1.0
+        solved = np.linalg.lstsq(columns / size, side, rcond=1e-8)[0] / size
+        return np.asarray(needed + np.tensordot(solved, courses, axes=1), dtype=np.float64)
+
+    def _free_motions(self, structure: Structure, step: float) -> FloatArray:
+        key = b"".join(
+            m.tobytes() for m in (structure.mass, structure.damping, structure.stiffness)
+        )
+        key += repr(structure.branches).encode()
+        if key != self._free_key:
+            rows = max(m.rows for m in self.motions.values())
+            self._free_key = key
+            self._free_courses = HiddenSystem.of(structure).free_torques(step, rows)
+        return self._free_courses
 
 
 def _without_unknown(hypothesis: Hypothesis, lines: Lines, values: FloatArray) -> FloatArray:

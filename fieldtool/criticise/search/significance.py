@@ -22,6 +22,8 @@ BLOCK = 0.2
 """s: shortest block."""
 FEWEST, MOST = 12, 400
 """Blocks altogether."""
+FEWEST_EFFECTIVE = 6
+"""Effective number of blocks that is always granted."""
 Parts = Sequence[tuple[Lines, FloatArray]]
 
 
@@ -74,7 +76,8 @@ def chance(gains: FloatArray) -> tuple[float, float]:
         return 0.0, 1.0
     centred = gains - gains.mean()
     r = float(np.sum(centred[1:] * centred[:-1]) / np.sum(centred**2))
-    r = min(max(r, 0.0), 0.9)
-    effective = max(n * (1 - r) / (1 + r), 2.0)
+    # Few blocks show a correlation by chance: only what is more than its standard error counts.
+    r = min(max(r - 1.0 / np.sqrt(n), 0.0), 0.9)
+    effective = max(n * (1 - r) / (1 + r), min(n, FEWEST_EFFECTIVE))
     t = float(gains.mean()) / (spread / np.sqrt(effective))
     return t, float(student.sf(t, effective - 1))
