@@ -15,7 +15,7 @@ from fieldtool.identify.likelihood.parameters import (
 )
 from fieldtool.identify.likelihood.record_data import RecordData, Spectrum, spectrum_of
 from fieldtool.identify.likelihood.refine import RefinedModel, machine_response, refine
-from fieldtool.identify.multisine.dry_friction import signs_of_velocity
+from fieldtool.identify.multisine.dry_friction import VELOCITY_BAND, signs_of_velocity
 from fieldtool.identify.multisine.whole_records import WholeRecords
 from fieldtool.records.closed_loop import AxisLoop, Biquad, ClosedLoop
 from fieldtool.records.model import MachineModel
@@ -194,7 +194,9 @@ def test_signs_of_velocity(fresh_rng):
     one = Experiment("m", "other", ("x",), (), None, time, noisy[:, None], 0 * noisy[:, None])
     signs = signs_of_velocity(one, STEP, 3.3)[:, 0]
     clear = np.abs(velocity) > 0.02 * np.abs(velocity).max()
-    clear[:20] = clear[-20:] = False
+    end = int(1 / (VELOCITY_BAND * 3.3 * STEP))  # a period of the fastest that is kept
+    assert np.mean(signs != np.sign(velocity)) < 0.02
+    clear[:end] = clear[-end:] = False
     assert np.array_equal(signs[clear], np.sign(velocity[clear]))
 
 
