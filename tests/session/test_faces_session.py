@@ -1,4 +1,4 @@
-"""Whole sessions on machines with makers' drives: what is found is what the reference drive finds.
+"""Whole sessions on machines with makers' drives: what is found is what is there.
 
 Two kinds of drives stand on one bus.  Masses and springs have to be those of the machine behind;
 gains that are written have to arrive in the firmware, which converts by the makers' own formulas.
@@ -15,32 +15,33 @@ from drives.sim.faces.others import PASSWORD
 from drives.sim.servo_kernel import Parameter
 from fieldtool import workflow
 from fieldtool.design.tuning import AxisTuning, Tuning
+from fieldtool.records.model import MachineModel
 from fieldtool.workflow import Options, SessionResult
 from fieldtool.writeback.transaction import changes_for
 from tests.faces import machine_of, simulated
 
+pytestmark = pytest.mark.timeout(900)  # a busy computer plans and fits slowly
 PAIRS = {
-    "reference": ("reference", "reference"),
-    "epos4": ("epos4*", "epos4-dual-loop"),
+    "epos4": ("epos4*", "reference"),
     "novanta": ("novanta*", "epos4-dual-loop"),
-    "elmo": ("elmo-gold", "cia402*"),
-    "copley": ("copley*", "nanotec*"),
+    "elmo": ("elmo-gold", "nanotec*"),
 }
-"""A star: the packaged profile with its unknown facts filled in."""
-WRITTEN = ("reference", "epos4", "novanta")
+"""A star: the packaged profile with its unknown facts filled in.  All kinds, and how each compares
+with the reference drive: benchmark ``faces``."""
+WRITTEN = ("epos4", "novanta")
 CLOSE = {"epos4": 5e-3}
 """Relative; a PID with D on the error feeds the reference's velocity forward in steps, and what they
 do within one SYNC is taken off to first order.  Else 2e-4: rounding and noise."""
 GAINS = ("position_p", "velocity_p", "velocity_i", "inertia_ff")
 
 
-def numbers(result: SessionResult) -> dict[str, float]:
+def numbers(model: MachineModel) -> dict[str, float]:
     """Masses, springs and couplings by name."""
     found = {}
-    for axis in result.model.axes:
+    for axis in model.axes:
         found |= {f"{axis.name} mass {k}": m.value for k, m in enumerate(axis.masses)}
         found |= {f"{axis.name} spring {k}": s.value for k, s in enumerate(axis.springs)}
-    found |= {"-".join(c.axes): c.value for c in result.model.couplings}
+    found |= {"-".join(c.axes): c.value for c in model.couplings}
     return found
 
 
@@ -70,11 +71,13 @@ def settings(running, axis: int) -> dict[str, float]:
     return {name: running.axes.get(axis, Parameter[name.upper()]) for name in GAINS}
 
 
-@pytest.mark.parametrize("pair", [p for p in PAIRS if p != "reference"])
-def test_what_is_found_is_what_the_reference_drive_finds(sessions, pair):
-    found, reference = numbers(sessions(pair)[0]), numbers(sessions("reference")[0])
-    print({k: f"{found[k] / reference[k] - 1:+.2e}" for k in reference})
-    assert found == pytest.approx(reference, rel=CLOSE.get(pair, 2e-4))
+@pytest.mark.parametrize("pair", PAIRS)
+def test_what_is_found_is_what_is_there(sessions, pair):
+    result: SessionResult = sessions(pair)[0]
+    assert result.truth is not None
+    found, truth = numbers(result.model), numbers(result.truth)
+    print({k: f"{found[k] / truth[k] - 1:+.2e}" for k in truth})
+    assert found == pytest.approx(truth, rel=CLOSE.get(pair, 3e-4))
 
 
 @pytest.mark.parametrize("pair", WRITTEN)
