@@ -12,8 +12,10 @@ import signal
 import socket
 import sys
 import threading
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -58,6 +60,9 @@ class SocketcandEnd(can.BusABC):
         self._listening = socket.create_server(("127.0.0.1", 0))
         self._client: socket.socket | None = None
         self._buffer = b""
+        self._greeted = inf
+        """Time from which frames may be sent: the client takes each answer of the greeting for a whole
+        packet, so nothing else may follow at once."""
         self.port = int(self._listening.getsockname()[1])
         self.on_frame: Callable[[can.Message], None] = lambda _: None
         """Sees each of the tool's frames before the drives do."""
@@ -84,7 +89,7 @@ class SocketcandEnd(can.BusABC):
         client, _ = self._listening.accept()
         client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._hang_up()
-        self._client, self._buffer = client, b""
+        self._client, self._buffer, self._greeted = client, b"", inf
         client.sendall(b"< hi >")
 
     def _read(self) -> None:
@@ -110,10 +115,13 @@ class SocketcandEnd(can.BusABC):
                     data=[int(byte, 16) for byte in data],
                 )
             self._say("< ok >")
+            if words[0] == "rawmode":
+                self._greeted = time.monotonic() + 0.3
         return None
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        self._say(f"< frame {msg.arbitration_id:03X} 0.0 {bytes(msg.data).hex()} >")
+        if time.monotonic() >= self._greeted:
+            self._say(f"< frame {msg.arbitration_id:03X} 0.0 {bytes(msg.data).hex()} >")
 
     def _say(self, text: str) -> None:
         if self._client is not None:
