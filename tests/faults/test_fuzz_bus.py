@@ -1,4 +1,4 @@
-"""Random frames and wrong SDO answers: no traceback, no hang, drives off, no wrong write."""
+"""Random frames on the bus: no traceback, no hang, drives off, no wrong write."""
 
 from random import Random
 
@@ -19,13 +19,12 @@ def test_frames_that_are_nobodys_do_not_matter():
     assert outcome.problems == ()
 
 
-@pytest.mark.parametrize("kind", ["look-alikes", "answers"])
 @pytest.mark.parametrize("moment", [Moment.SWEEP, Moment.WRITE])
-def test_frames_that_look_like_the_nodes_own(kind, moment):
+def test_frames_that_look_like_the_nodes_own(moment):
     print("seed", SEED)
     random = Random(SEED)
     for k in range(8):
         rate = random.choice((0.05, 0.3, 1.0))
-        noise = Noise(kind, rate, random.getrandbits(32), random.choice((0, 100, 300)))
+        noise = Noise("look-alikes", rate, random.getrandbits(32), random.choice((0, 100, 300)))
         outcome = disturbed(noise, moment)
         assert outcome.problems == (), f"{k}: {noise}: {outcome.said[:600]}"
