@@ -410,7 +410,7 @@ ROWS: tuple[Row, ...] = (
         _one(EncoderStuck),
         stopped("arm: does not move by its encoder", farthest=12.0),
         stopped("arm: does not move by its encoder", cycles=2500, farthest=12.0),
-        stopped("arm: does not move at all while its target moves", cycles=60, farthest=FAR),
+        stopped("arm: does not move at all while its target moves", cycles=100, farthest=FAR),
         NOT_IN_USE,
     ),
     Row(
@@ -426,7 +426,7 @@ ROWS: tuple[Row, ...] = (
         _one(MotorReversed),
         stopped("arm: .*the wrong way", farthest=FAR),
         stopped("arm: .*the wrong way", cycles=300, farthest=FAR),
-        stopped("arm: .*above the limit", cycles=60),
+        stopped("arm: .*above the limit", cycles=100),
         NOT_IN_USE,
     ),
     Row(
@@ -450,7 +450,7 @@ ROWS: tuple[Row, ...] = (
         _one(BrakeClosed),
         stopped("arm: does not move by its encoder.*brake", farthest=FAR),
         stopped("arm: does not move by its encoder.*brake", cycles=2500, farthest=FAR),
-        stopped("arm: does not move at all.*brake", cycles=60, farthest=FAR),
+        stopped("arm: does not move at all.*brake", cycles=100, farthest=FAR),
         NOT_IN_USE,
     ),
     Row(
