@@ -13,7 +13,7 @@ from rich.text import Text
 from fieldtool import workflow
 from fieldtool.cli.bus_options import Bitrate, Channel, Interface, on_bus
 from fieldtool.cli.output import console_of, print_json
-from fieldtool.cli.stop_key import stop_key
+from fieldtool.cli.stop_key import somebody_there, stop_key
 from fieldtool.cli.tracing import TraceFile, TraceWanted, trace_path
 from fieldtool.experiment.checks.finding import Finding, Status
 from fieldtool.workflow.checking import CheckResult, unit_of, way_of
@@ -59,7 +59,7 @@ def check(
             return move
         if yes:
             return True
-        if not sys.stdin.isatty():
+        if not somebody_there():
             return False
         axes = ", ".join(f"{a.name} by {way_of(a):.2g} {unit_of(a)}" for a in profile.axes)
         return typer.confirm(

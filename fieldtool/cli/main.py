@@ -46,7 +46,7 @@ from fieldtool.cli.screen import (
     show_parameters,
     show_result,
 )
-from fieldtool.cli.stop_key import StopKey, may_move, stop_key
+from fieldtool.cli.stop_key import StopKey, may_move, somebody_there, stop_key
 from fieldtool.cli.tracing import TraceFile, TraceWanted, trace_path
 from fieldtool.errors import (
     FieldtoolError,
@@ -171,7 +171,7 @@ def _asker(
             return True
         planned = WriteBack((), tuple(changes), in_memory=False, stored=False, backup=None)
         console.print(parameter_table_of(planned, console.width))
-        if not sys.stdin.isatty():
+        if not somebody_there():
             console.print(
                 "  Not written: there is nobody to ask. Use --yes to write without asking."
             )

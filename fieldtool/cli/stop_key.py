@@ -11,6 +11,7 @@ import typer
 
 from drives.canopen_drive.interrupts import SIGNALS
 from drives.errors import UserStopError
+from fieldtool.errors import PlanRefusedError
 
 ASKED_WITHIN = 0.5
 """Seconds: a motion asks for a stop so often, at least."""
@@ -72,7 +73,24 @@ def stop_key(answer: str = "Stopping all axes ...") -> Iterator[StopKey]:
 
 
 def may_move(yes: bool) -> Callable[[str], bool] | None:
-    """Return how to ask a person before the machine moves; None where nobody has to be asked."""
-    if yes or not sys.stdin.isatty():
+    """Return how to ask a person before the machine moves; None where nobody has to be asked.
+
+    Where there is nobody to ask, nothing moves without ``--yes``.
+    """
+    if yes:
         return None
-    return lambda sentence: typer.confirm(f"{sentence}\nMove the machine now?", err=True)
+
+    def ask(sentence: str) -> bool:
+        if not somebody_there():
+            raise PlanRefusedError(
+                "there is nobody to ask before the machine moves. Use --yes to move it without asking. "
+                "Nothing was moved."
+            )
+        return typer.confirm(f"{sentence}\nMove the machine now?", err=True)
+
+    return ask
+
+
+def somebody_there() -> bool:
+    """Whether a person can answer a question."""
+    return sys.stdin is not None and sys.stdin.isatty()

@@ -15,6 +15,7 @@ from itertools import islice
 from pathlib import Path
 
 import yaml
+from filelock import FileLock, Timeout
 
 from drives.errors import ProfileError
 from drives.parameters import Journal, Phase, load_journal, save_journal
@@ -46,6 +47,8 @@ class JournalKeeper:
     def __init__(self, path: Path) -> None:
         self.path = path
         self._noted = False
+        self._lock = _lock_of(path)
+        """Held as long as the journal is open: others see that this process is alive."""
 
     def __call__(self, journal: Journal) -> None:
         """Bring the journal to the disk before this returns.
@@ -54,7 +57,14 @@ class JournalKeeper:
         ------
         OSError
             If journal or notes can not be written.
+        UnfinishedWriteError
+            If another process is at work with this journal; nothing was written.
         """
+        if journal.is_open and not self._lock.is_locked:
+            try:
+                self._lock.acquire()
+            except Timeout:
+                raise UnfinishedWriteError(_at_work(self.path.parent)) from None
         save_journal(journal, self.path)
         if journal.is_open and not self._noted:
             self._note(journal)
@@ -62,6 +72,7 @@ class JournalKeeper:
         elif not journal.is_open:
             for record in journal.drives:
                 remove_durably(_note_of(journal.machine, record))
+            self._lock.release()
 
     def settle(self, journal: Journal) -> None:
         """Remove the notes of drives that are in order, where others of the journal are not."""
@@ -79,6 +90,7 @@ class JournalKeeper:
             remove_durably(self.path)
             for record in journal.drives:
                 remove_durably(_note_of(journal.machine, record))
+        self._lock.release()
 
     def _note(self, journal: Journal) -> None:
         state_folder().mkdir(parents=True, exist_ok=True)
@@ -153,7 +165,33 @@ def refuse_unfinished(machine: str, drives: Sequence[ParameterDrive], session: P
                 raise _refusal(journal_file.parent, axis, found)
 
 
+def _lock_of(journal_file: Path) -> FileLock:
+    """Return the lock of whoever works with a journal; one that is taken is not waited for."""
+    return FileLock(journal_file.with_suffix(".lock"), timeout=0)
+
+
+def _is_at_work(folder: Path) -> bool:
+    """Whether a living process has the journal of this session open."""
+    lock = _lock_of(folder / JOURNAL)
+    if not Path(lock.lock_file).is_file():
+        return False
+    try:
+        with lock:
+            return False
+    except (Timeout, OSError):
+        return True
+
+
+def _at_work(folder: Path) -> str:
+    return (
+        f"another fieldtool is at work on this machine, with the session {folder}. Wait until it has "
+        "ended, or stop it there with Ctrl-C. Nothing was moved or written."
+    )
+
+
 def _refusal(folder: Path, axis: str, journal: Journal) -> UnfinishedWriteError:
+    if _is_at_work(folder):
+        return UnfinishedWriteError(f"{axis}: {_at_work(folder)}")
     what = (
         "a write of parameters was cut off, and the drives may hold old and new ones mixed"
         if journal.writes

@@ -1,7 +1,9 @@
 """What is refused before anything is enabled: profiles, nodes, drives, limits, folders, files."""
 
+import io
 import re
 import socket
+import sys
 from copy import deepcopy
 from dataclasses import replace
 
@@ -571,3 +573,16 @@ def test_everything_of_a_machine_is_what_the_bench_says(bench):
     assert bench.changed() == {ARM: {"0x6065:00": (104_858, 5)}}
     assert np.all([node.motion.powered is False for node in bench.machine.nodes])
     assert replace(bench.machine.description, seed=1).seed == 1
+
+
+def test_nothing_moves_where_nobody_can_be_asked(bench: Bench) -> None:
+    """No terminal, or none at all: without --yes it is refused, and no axis is enabled."""
+    for stream in (io.StringIO(""), None):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(sys, "stdin", stream)
+            out = bench.folder / f"asked-{stream is None}"
+            outcome = bench.command("run", bench.profile, "--write", "--time", 12, "--out", out)
+        assert outcome.code == 3
+        assert "nobody to ask" in outcome.err
+        assert "--yes" in outcome.err
+        assert bench.powered() == {}
