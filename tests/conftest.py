@@ -1,5 +1,7 @@
 """Seeds that vary from run to run and are printed, and random machines to try."""
 
+import os
+import tempfile
 from collections.abc import Callable
 
 import numpy as np
@@ -8,6 +10,8 @@ import pytest
 from fieldtool.records.model import AxisModel, Coupling, Estimate, MachineModel
 
 RandomModel = Callable[..., MachineModel]
+os.environ["FIELDTOOL_STATE_DIR"] = tempfile.mkdtemp(prefix="fieldtool-notes-")
+"""Of this process: fixtures of whole modules keep no notes where other test processes see them."""
 
 
 def _random_model(

@@ -169,7 +169,7 @@ def test_an_encoder_that_stands_still_is_found(small_bench) -> None:
     outcome = small_bench.command("check", small_bench.profile, "--move", "--json")
     assert outcome.code == 4
     found = findings(outcome)["table", "direction"]
-    assert (found["status"], "does not follow" in found["found"]) == ("fail", True)
+    assert (found["status"], "does not move" in found["found"]) == ("fail", True)
     assert small_bench.powered() == {}
     assert small_bench.changed() == {}
 

@@ -575,7 +575,7 @@ def test_everything_of_a_machine_is_what_the_bench_says(bench):
     assert replace(bench.machine.description, seed=1).seed == 1
 
 
-def test_nothing_moves_where_nobody_can_be_asked(bench: Bench) -> None:
+def test_nothing_moves_where_nobody_can_be_asked(bench) -> None:
     """No terminal, or none at all: without --yes it is refused, and no axis is enabled."""
     for stream in (io.StringIO(""), None):
         with pytest.MonkeyPatch.context() as patch:

@@ -171,6 +171,7 @@ def test_fieldtool_run_in_a_process_of_its_own(tmp_path, profile_of_two):
                 str(profile),
                 "--plan",
                 "classic",
+                "--yes",
                 "--out",
                 str(out),
             ],

@@ -1,6 +1,7 @@
 """Blocks of targets with torque offsets: rounded to the drive's units, refused above a limit."""
 
 from dataclasses import dataclass
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -25,6 +26,10 @@ class FakeDrive:
     node_id: int = 5
     position_unit: str = "rad"
     torque_unit: str = "N m"
+
+    @property
+    def axis_profile(self):
+        return SimpleNamespace(prior=SimpleNamespace(masses=(0.02,)))
 
 
 def channel(name="x", rated=4.0, limit=6.0, takes_offset=True):

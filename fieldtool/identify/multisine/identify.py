@@ -132,7 +132,7 @@ def identify_joint(
         first = _first_fit(_starts(start, modal, prior, kinds), data, priors)
         fitted, friction = fit.run(first)
         fitted = _with_free_motion(fitted, WholeRecords.of(recording, lines, friction), priors)
-    _check_explained(fit.unexplained(fitted), friction)
+        _check_explained(fit.unexplained(fitted), friction)
     notes += [unknown.reason for unknown in fitted.unknown]
     notes += _friction_notes(friction, recording)
     notes += _misfit_note(fitted)
