@@ -40,6 +40,8 @@ CIA402_DEVICE = 402
 STOP_NODE, ENTER_PRE_OPERATIONAL = 0x02, 0x80
 QUICK_STOP = 0x0002
 """Controlword."""
+WAKING = 0.1
+"""Seconds at least from one call to a node that does not answer to the next."""
 
 
 class CanopenDrive:
@@ -319,14 +321,19 @@ class CanopenDrive:
         Parameters
         ----------
         patience
-            Seconds to wait for it at most.
+            Seconds to wait for it at most.  Two drives that contradict each other are not waited
+            for: no time makes one of them.
         """
-        deadline = self.line.clock.now() + patience
+        clock = self.line.clock
+        deadline = clock.now() + patience
         while not self.answers():
-            if self.line.clock.now() >= deadline:
+            now = clock.now()
+            if now >= deadline or self.node.sdo.contradicted:
                 return False
             with suppress(DrivesError):
                 self.node.nmt.send_command(ENTER_PRE_OPERATIONAL)
+                self.line.wait(WAKING)
+            clock.wait_until(now + WAKING)  # on a bus that fails too: what fails may do so at once
         return True
 
     @property

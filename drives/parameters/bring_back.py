@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from drives.errors import DrivesError, SdoTimeoutError
-from drives.objects import ObjectAddress
+from drives.objects import DEVICE_TYPE, ObjectAddress
 from drives.parameters.access import take_over, unlock
 from drives.parameters.backup import DriveBackup
 from drives.parameters.journal import DriveRecord
@@ -96,7 +96,7 @@ def bring_back(
         If the drive does not answer.
     """
     if not drive.wakes(PATIENCE):
-        raise SilentDriveError(f"{drive.axis}: node {drive.node_id} does not answer")
+        raise SilentDriveError(_why_silent(drive))
     found = look(drive, record)
     unlock(drive)
     wanted = {entry.info.address: HeldObject(entry.info, entry.before) for entry in record.entries}
@@ -162,6 +162,18 @@ def _write(drive: ParameterDrive, held: HeldObject) -> str:
         _refuse_silent(drive, error)
         return str(error)
     return ""
+
+
+def _why_silent(drive: ParameterDrive) -> str:
+    """Return what is wrong with the answers of a drive that does not wake."""
+    silence = f"{drive.axis}: node {drive.node_id} does not answer"
+    try:
+        drive.read(DEVICE_TYPE)
+    except SdoTimeoutError:
+        return silence
+    except DrivesError as error:
+        return str(error)
+    return silence
 
 
 def _refuse_silent(drive: ParameterDrive, error: DrivesError) -> None:

@@ -20,11 +20,21 @@ def test_frames_that_are_nobodys_do_not_matter():
 
 
 @pytest.mark.parametrize("moment", [Moment.SWEEP, Moment.WRITE])
-def test_frames_that_look_like_the_nodes_own(moment):
+@pytest.mark.parametrize("kind", ["look-alikes", "answers"])
+def test_frames_that_look_like_the_nodes_own(kind, moment):
     print("seed", SEED)
     random = Random(SEED)
     for k in range(8):
         rate = random.choice((0.05, 0.3, 1.0))
-        noise = Noise("look-alikes", rate, random.getrandbits(32), random.choice((0, 100, 300)))
+        noise = Noise(kind, rate, random.getrandbits(32), random.choice((0, 100, 300)))
         outcome = disturbed(noise, moment)
         assert outcome.problems == (), f"{k}: {noise}: {outcome.said[:600]}"
+
+
+def test_drives_that_contradict_each_other_in_a_write_are_given_up_and_named():
+    outcome = disturbed(Noise("answers", 0.3, 2343595180, quiet=100), Moment.WRITE)
+    assert outcome.code == 7, outcome.said[:600]
+    assert "two answers came about 0x2010:01 that differ" in outcome.said
+    assert "two drives have this node id" in outcome.said
+    assert "(table, object 0x1000:00: the drive's answer was wrong: two answers" in outcome.said
+    assert outcome.problems == ()
