@@ -11,7 +11,6 @@ from drives.errors import (
     NotSupportedError,
     SdoAbortError,
     SdoError,
-    SdoTimeoutError,
 )
 from drives.objects import ObjectAddress, ObjectInfo, type_bits
 from drives.profile import UNKNOWN
@@ -71,25 +70,25 @@ class TemporaryObjects:
     def put_back(self) -> list[str]:
         """Write all old values, newest first; return what failed, in words.
 
-        A drive that does not answer any more is not asked for each of them.
+        A drive that does not answer any more, or not rightly, is not asked for each of them.
         """
         failures = []
         while self._before:
             info, before, matters = self._before.pop()
             try:
                 self._write_surely(info, before)
-            except SdoTimeoutError as error:
+            except SdoAbortError as error:
+                if matters:
+                    failures.append(str(error))
+            except DrivesError as error:
                 failures.append(str(error))
                 if self._before and not self._drive.answers():
                     left = dict.fromkeys(str(info.address) for info, *_ in self._before)
                     failures.append(
-                        f"{self._drive.axis}: node {self._drive.node_id} does not answer any more; "
-                        f"not put back: {', '.join(left)}. Switch the drive off and on."
+                        f"{self._drive.axis}: node {self._drive.node_id} gives no right answer any "
+                        f"more; not put back: {', '.join(left)}. Switch the drive off and on."
                     )
                     self._before.clear()
-            except DrivesError as error:
-                if matters:
-                    failures.append(str(error))
         return failures
 
     def _write_surely(self, info: ObjectInfo, value: float) -> None:

@@ -224,7 +224,13 @@ def open_session(
                     + "; ".join(left_out)
                     + "."
                 )
-            yield session, group
+            try:
+                yield session, group
+            except BaseException as error:
+                for text in group.warnings:  # what an earlier motion left matters all the more now
+                    if text not in getattr(error, "__notes__", ()):
+                        error.add_note(text)
+                raise
             for text in (*group.warnings, trace_problem(group.line.can_bus)):
                 if text:
                     session.warn(text)

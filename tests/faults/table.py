@@ -353,7 +353,7 @@ ROWS: tuple[Row, ...] = (
         refused("arm: node 12 answers more often than it is asked: two drives have this node id"),
         stopped("arm: (PDOs of node 12 come|its position jumped|the drive left)", cycles=5),
         stopped("arm: (PDOs of node 12 come|its position jumped|the drive left)", cycles=5),
-        harmless("both take what is written; the answer that fits is believed, and read back"),
+        mixed("arm, object 0x1010:01: .*two drives have this node id"),
     ),
     _stranger("SYNC", lambda n: Stranger(n, 0x80), "a SYNC"),
     _stranger(
