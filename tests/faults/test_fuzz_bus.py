@@ -31,10 +31,14 @@ def test_frames_that_look_like_the_nodes_own(kind, moment):
         assert outcome.problems == (), f"{k}: {noise}: {outcome.said[:600]}"
 
 
-def test_drives_that_contradict_each_other_in_a_write_are_given_up_and_named():
-    outcome = disturbed(Noise("answers", 0.3, 2343595180, quiet=100), Moment.WRITE)
-    assert outcome.code == 7, outcome.said[:600]
-    assert "two answers came about 0x2010:01 that differ" in outcome.said
-    assert "two drives have this node id" in outcome.said
-    assert "(table, object 0x1000:00: the drive's answer was wrong: two answers" in outcome.said
-    assert outcome.problems == ()
+@pytest.mark.parametrize(
+    ("noise", "moment"),
+    [
+        (Noise("answers", 0.3, 2343595180, quiet=100), Moment.WRITE),
+        (Noise("answers", 0.05, 589927323, quiet=300), Moment.SWEEP),
+    ],
+    ids=["called a node without a pause", "did not say what was not put back"],
+)
+def test_what_went_wrong_once(noise, moment):
+    outcome = disturbed(noise, moment)
+    assert outcome.problems == (), outcome.said[:600]

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from drives.errors import NothingMovedError, SafetyStopError
-from drives.sim.faults import SdoSilent
+from drives.sim.faults import SdoRefused, SdoSilent
+from fieldtool.workflow.session import never, open_session
 
 TABLE, ARM = 11, 12
 HOLD = 400
@@ -222,3 +223,18 @@ def test_a_drive_behind_a_gear_is_refused(make_bench):
     bench = make_bench(objects={TABLE: {(0x6091, 1): 50, (0x6091, 2): 1}})
     with pytest.raises(NothingMovedError, match=r"0x6091 is 50/1"), bench.connected():
         pass
+
+
+def test_what_a_motion_left_is_said_when_a_later_step_fails(bench):
+    """The motion itself ended well, so it has no error that could say so."""
+    with (
+        pytest.raises(NothingMovedError, match="later") as refused,
+        open_session(bench.profile, bench.out, None, never) as (_, group),
+    ):
+        with group.motion(0.002) as motion:
+            bench.inject(SdoRefused(ARM, 0x6007, 0))
+            motion.stream(held(motion.position))
+        raise NothingMovedError("something later")
+    assert bench.changed() == {ARM: {"0x6007:00": (1, 3)}}
+    (note,) = refused.value.__notes__
+    assert note.startswith("could not be put back: arm, object 0x6007:00: the drive refused")
