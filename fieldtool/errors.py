@@ -5,6 +5,7 @@
     FieldtoolError
     ├── FileFormatError          a file is not what it should be (file, line, column, what to do)
     ├── OutputError              a folder or file can not be written
+    ├── NoSuchAxisError          an axis was named that the recording does not have
     ├── UnfinishedWriteError     a write-back was cut off and has to be taken back first
     ├── PlanRefusedError         the experiment would leave a limit, or nothing safe is possible
     └── IdentificationError      the data do not allow the answer
@@ -34,6 +35,10 @@ class FileFormatError(FieldtoolError):
 
 class OutputError(FieldtoolError):
     """A result can not be written: disk full, no such folder, no permission."""
+
+
+class NoSuchAxisError(FieldtoolError):
+    """An axis was named that is not there; the message lists those that are."""
 
 
 class UnfinishedWriteError(FieldtoolError):

@@ -77,7 +77,7 @@ def check(
             say=lambda text: console.print(Text(f"▶ {text}", style="bold")),
         )
     show(console, result)
-    if traced is not None:
+    if traced is not None and traced.is_file():
         console.print(Text(f"Every frame is in {traced}."))
     if as_json:
         print_json(result.as_dict())

@@ -52,6 +52,7 @@ from fieldtool.errors import (
     FieldtoolError,
     FileFormatError,
     IdentificationError,
+    NoSuchAxisError,
     OutputError,
     PlanRefusedError,
 )
@@ -72,6 +73,7 @@ EXIT_CODES: tuple[tuple[type[Exception], int], ...] = (
     (IdentificationError, 5),
     (ProfileError, 2),
     (FileFormatError, 2),
+    (NoSuchAxisError, 2),
     (PlanRefusedError, 3),
     (OutputError, 3),
     (NothingMovedError, 3),

@@ -49,11 +49,16 @@ def sentences(restored: Restored) -> list[str]:
             f"{restored.cut_off.begun} had been cut off. It was taken back: all drives hold the old "
             "values."
         )
-    differed = (
-        "1 parameter differed and was" if count == 1 else f"{count} parameters differed and were"
-    )
-    said.append(f"{differed} restored; all were read back.")
     not_stored = [o.axis for o in restored.outcomes if o.memory is not Memory.OLD]
+    if count == 0:
+        said.append("Every drive held what the backup holds; all was read back.")
+        if not_stored and restored.cut_off is None:
+            return [*said, *restored.notes]
+    else:
+        differed = "1 parameter differed and was"
+        if count > 1:
+            differed = f"{count} parameters differed and were"
+        said.append(f"{differed} restored; all were read back.")
     if not not_stored:
         said.append("They are stored too: they survive a power cycle.")
     elif len(not_stored) == len(restored.outcomes):

@@ -43,6 +43,8 @@ PACE_FROM = 0.03
 """Share done from which the pace says how long the rest will take."""
 QUIET_INTERVAL = 5.0
 """Seconds between progress lines where there is no terminal."""
+NUMBER_WIDTH = 9
+"""Characters that a column of numbers is not made narrower than."""
 
 
 class _Left(ProgressColumn):
@@ -235,8 +237,14 @@ def _add(table: Table, *cells: str, style: str = "") -> None:
 
 
 def _column(table: Table, title: str, *, words: bool) -> None:
-    """Add a column that loses nothing on a narrow terminal: what does not fit is folded."""
-    table.add_column(title, justify="left" if words else "right", overflow="fold")
+    """Add a column that loses nothing on a narrow terminal: words that do not fit are folded.
+
+    Numbers stay whole as long as there is any room: half a number is a wrong number.
+    """
+    if words:
+        table.add_column(title, overflow="fold")
+    else:
+        table.add_column(title, justify="right", overflow="fold", min_width=NUMBER_WIDTH)
 
 
 def _clock(seconds: float) -> str:
@@ -273,7 +281,7 @@ def model_table(
         units_of(axis.kind, torque_units[k] if torque_units else "")
         for k, axis in enumerate(model.axes)
     ]
-    table = Table(box=None, padding=(0, 2))
+    table = Table(box=None, padding=(0, 1))
     for title in ("axis", "what", "value", "± (95 %)", "unit"):
         _column(table, title, words=title in ("axis", "what", "unit"))
     if truth is not None:

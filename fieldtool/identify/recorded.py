@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fieldtool.errors import NotEnoughDataError
+from fieldtool.errors import NoSuchAxisError, NotEnoughDataError
 from fieldtool.frf.response import FrequencyResponse
 from fieldtool.frf.stepped.responses import stepped_responses
 from fieldtool.identify.chain import ChainResult, identify_chain
@@ -58,6 +58,8 @@ def identify_recording(
 
     Raises
     ------
+    NoSuchAxisError
+        If a length is given for an axis that was not recorded.
     NotEnoughDataError
         If there is nothing that can be identified, or a chain's length is not known.
     IdentificationError
@@ -65,7 +67,7 @@ def identify_recording(
     """
     unknown = set(masses) - set(recording.names)
     if unknown:
-        raise NotEnoughDataError(
+        raise NoSuchAxisError(
             f"the recording has no axis {', '.join(sorted(unknown))}; its axes are "
             f"{', '.join(recording.names)}."
         )

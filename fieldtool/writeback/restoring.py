@@ -212,7 +212,8 @@ def bring_back(
 
     transaction = Transaction(taking_part, journal, source.backup, keeper, tell)
     try:
-        transaction.restore()
+        with keeper:
+            transaction.restore()
     except OSError as error:
         raise not_kept(keeper, error) from error
     keeper.settle(transaction.journal)

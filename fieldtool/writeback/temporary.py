@@ -30,11 +30,12 @@ def backed_up(machine: str, drives: Sequence[CanopenDrive], backup_path: Path) -
     keeper = JournalKeeper(backup.with_name(JOURNAL))
     journal = planned_journal(machine, drives, (), backup.name, Storing.NONE)
     journal = replace(journal, goal=Goal.OLD).turned_back(distrust=True)
-    try:
-        keeper(journal)
-    except OSError as error:
-        raise not_kept(keeper, error) from error
-    try:
-        yield
-    finally:
-        keeper.forget(journal)
+    with keeper:
+        try:
+            keeper(journal)
+        except OSError as error:
+            raise not_kept(keeper, error) from error
+        try:
+            yield
+        finally:
+            keeper.forget(journal)

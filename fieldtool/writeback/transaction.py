@@ -137,7 +137,8 @@ def apply(
     backup = load_backup(backup_path)
     transaction = Transaction(drives, journal, backup, keeper, tell_storing(drives, say))
     try:
-        transaction.write()
+        with keeper:
+            transaction.write()
     except OSError as error:
         raise not_kept(keeper, error) from error
     written = tuple(Written(change, change.after) for change in changes)

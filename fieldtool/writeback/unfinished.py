@@ -38,6 +38,8 @@ HEAD_BYTES = 1000
 class JournalKeeper:
     """Saves a journal, and leaves a note for each drive as long as it is open.
 
+    A context manager: however the work ends, others may then take up what it left.
+
     Parameters
     ----------
     path
@@ -49,6 +51,12 @@ class JournalKeeper:
         self._noted = False
         self._lock = _lock_of(path)
         """Held as long as the journal is open: others see that this process is alive."""
+
+    def __enter__(self) -> "JournalKeeper":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._lock.release()
 
     def __call__(self, journal: Journal) -> None:
         """Bring the journal to the disk before this returns.
@@ -72,7 +80,6 @@ class JournalKeeper:
         elif not journal.is_open:
             for record in journal.drives:
                 remove_durably(_note_of(journal.machine, record))
-            self._lock.release()
 
     def settle(self, journal: Journal) -> None:
         """Remove the notes of drives that are in order, where others of the journal are not."""
@@ -90,7 +97,6 @@ class JournalKeeper:
             remove_durably(self.path)
             for record in journal.drives:
                 remove_durably(_note_of(journal.machine, record))
-        self._lock.release()
 
     def _note(self, journal: Journal) -> None:
         state_folder().mkdir(parents=True, exist_ok=True)

@@ -8,11 +8,13 @@ from pathlib import Path
 import pytest
 import yaml
 
-from drives.canopen_drive import CanopenDrive
+from drives.canopen_drive import CanopenDrive, connect
 from drives.parameters import Memory, Phase, load_journal, save_journal
 from drives.parameters.backup import checksum
+from drives.profile import load_machine
 from drives.sim.faults import DriveFault, NodeVanishes
 from fieldtool.writeback import unfinished
+from fieldtool.writeback.temporary import backed_up
 
 TABLE, ARM = 11, 12
 VELOCITY_P, VELOCITY_I, POSITION_P = (0x2010, 2), (0x2010, 3), (0x2010, 1)
@@ -429,3 +431,20 @@ def test_a_drive_that_is_dead_is_left_out_and_the_others_come_back(session, cut_
     assert session.command("restore", session.out, "--without", "leg").code == 2
     outcome = session.command("restore", session.out, "--without", "arm", "--without", "table")
     assert outcome.code in (2, 3)
+
+
+def test_a_session_at_work_is_not_taken_for_one_that_was_cut_off(bench):
+    """While a living process has the journal open, neither a new session nor a restore goes on."""
+    assert bench.measure("--time", "12", plan="fast").code == 0
+    folder = bench.out
+    with (
+        connect(load_machine(bench.profile)) as group,
+        backed_up("bench", group.drives, folder / "parameters-before.yaml"),
+    ):
+        other = bench.command("measure", bench.profile, "--out", bench.folder / "other")
+        back = bench.command("restore", folder)
+    for outcome in (other, back):
+        assert outcome.code == 3
+        assert "another fieldtool is at work" in outcome.err
+        assert "cut off" not in outcome.err
+    assert bench.command("restore", folder).code == 0
