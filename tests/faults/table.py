@@ -369,7 +369,7 @@ ROWS: tuple[Row, ...] = (
         lambda n: Stranger(n, 0, b"\2\0", times=1),
         r"the NMT command stop \(0x02\) to all nodes",
         connecting=refused(r"table, object 0x6\d+:00: node 11 did not answer"),
-        write=mixed("(table|arm).*node 1[12]"),
+        write=Expected((6, 7), "(table|arm).*node 1[12]"),
     ),
     _stranger(
         "NMT pre-operational",
