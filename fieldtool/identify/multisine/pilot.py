@@ -41,6 +41,8 @@ SMALLEST = 1e-12
 """rad or m: noise of a position that shows none."""
 FRICTION_ROUNDS = 6
 """Of fitting anew without dry friction, at most."""
+PUSHING = 5.0
+"""Standard errors below zero from which friction can not be one: it would bring energy in."""
 FRICTION_TAKEN = 2.0
 """Standard errors from which dry friction is taken off before the next fit: a model that was fitted
 with it hides a part of it, and the rest stands out more from one fit to the next."""
@@ -101,6 +103,13 @@ def read_pilot(recording: Recording, prior: MachineModel) -> PilotFindings:
         noise = _noise(phasors, experiments, step, fitted.model, fitted.delay_values)
     else:
         fitted, noise = _with_free_motion(fitted, records, prior)
+    if (pushing := _pushing_axis(fitted.model)) is not None:
+        notes.append(
+            f"The model that fits the pilot best can not be: friction of {pushing} would push its axis. "
+            "The main experiments are planned with the machine as last accepted."
+        )
+        noise = _noise(phasors, experiments, step, prior, np.zeros(len(prior.axes)))
+        return PilotFindings(prior, noise, None, tuple(notes), ratios)
     for k in friction.seen(FRICTION_SEEN):
         unit = recording.axes[k].torque_unit
         one = friction.torque[k]
@@ -109,6 +118,15 @@ def read_pilot(recording: Recording, prior: MachineModel) -> PilotFindings:
             f"{100 * friction.share[k]:.0f} % of the pilot's torque."
         )
     return PilotFindings(fitted.model, noise, friction, tuple(notes), ratios)
+
+
+def _pushing_axis(model: MachineModel) -> str | None:
+    """Return the axis whose viscous friction is negative beyond its error: a fit gone astray."""
+    for axis in model.axes:
+        friction = axis.viscous_friction
+        if friction.value < -PUSHING * friction.std:
+            return axis.name
+    return None
 
 
 def _torque_ratios(phasors: Sequence[Phasors], prior: MachineModel) -> FloatArray:
