@@ -16,6 +16,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 from rich.text import Text
+from threadpoolctl import threadpool_limits
 
 from drives.errors import (
     BusError,
@@ -533,7 +534,9 @@ def exit_code(error: BaseException) -> int:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run a command; errors become one sentence on standard error and an exit code."""
     try:
-        app(args=None if arguments is None else list(arguments))
+        # matrices here are small: threads of linear algebra only stand in each other's way
+        with threadpool_limits(limits=1):
+            app(args=None if arguments is None else list(arguments))
     except (FieldtoolError, DrivesError) as error:
         sys.stderr.write(f"fieldtool: {error}\n")
         for note in dict.fromkeys(getattr(error, "__notes__", ())):
