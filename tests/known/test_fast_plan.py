@@ -108,9 +108,13 @@ def test_no_axis_ever_floated(result: SessionResult) -> None:
 def test_a_pilot_whose_fit_goes_astray_is_not_followed(tmp_path) -> None:
     """With this tooling the pilot's fit ends at a friction that pushes, as of an unstable loop."""
     machine = drawn_anew(2163657066)
-    register(CHANNEL, simulated_machine(machine))
+    channel = f"{CHANNEL}-astray"
+    machine = machine.model_copy(
+        update={"bus": machine.bus.model_copy(update={"channel": channel})}
+    )
+    register(channel, simulated_machine(machine))
     try:
         options = Options(plan="fast", excitation_time=SECONDS)
         assert workflow.measure(machine, tmp_path / "one", options) < 1.001 * SECONDS
     finally:
-        unregister(CHANNEL)
+        unregister(channel)
