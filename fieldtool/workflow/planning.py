@@ -12,6 +12,7 @@ from fieldtool.experiment.multisine.design import (
     MORE_PERIODS,
     PERIODS,
     PILOT_SHARE,
+    ROUND,
     experiments_for,
     likely_torques,
     mode_band,
@@ -41,8 +42,6 @@ NEARLY, CANDIDATES = 0.8, 10
 than a little more time."""
 LONG_ENOUGH = 2.5
 """Of the shortest period, from which an experiment has a period more."""
-ROUND = 0.04
-"""Seconds that a pilot's period is a whole number of, so that it is one of all cycle times."""
 PILOT_SHAPE = Shape(-0.75)
 """Spread of the pilot: the machine as last accepted is not worth a finer one."""
 MARGIN = 2.0
@@ -152,16 +151,36 @@ def timing(setting: Setting, seconds: float) -> Timing:
     Where the time is not even enough for the shortest experiments, that much is taken.
     """
     axes, settle = len(setting.loops), settle_time(setting.model)
-    seconds -= settle  # the pilot ends with a fade-out, as the main experiments do
-    least = ROUND * float(np.ceil(shortest_period(setting.model) / ROUND))
+    seconds -= settle + ROUND  # the pilot ends with a fade-out, as the main experiments do
+    least = _least_period(setting.model)
     longest = (PILOT_TIME * seconds / axes - settle) / PERIODS
     count, period = (
         (axes, ROUND * float(np.floor(longest / ROUND))) if longest >= least else (1, least)
     )
-    shortest = axes * (settle + PERIODS * least) + settle
-    left = max(float(seconds - count * (settle + PERIODS * period)), shortest)
+    left = max(float(seconds - count * (settle + PERIODS * period)), _least_main(setting))
     more = ((left - settle) / axes - settle) / MORE_PERIODS >= LONG_ENOUGH * least
     return Timing(period, count, MORE_PERIODS if more else PERIODS, left)
+
+
+def _least_period(model: MachineModel) -> float:
+    """Return the shortest period that is one of all cycle times, s."""
+    return ROUND * float(np.ceil(shortest_period(model) / ROUND - 1e-9))
+
+
+def _least_main(setting: Setting) -> float:
+    """Return the seconds of the shortest main experiments, fade-out and final rest included."""
+    settle, axes = settle_time(setting.model), len(setting.loops)
+    return axes * (settle + PERIODS * _least_period(setting.model)) + settle + ROUND
+
+
+def _enough(setting: Setting, times: Timing) -> float:
+    """Return the seconds in all that leave enough for the shortest main experiments of this machine.
+
+    The pilot is longer in a longer time, but takes no more than its share or what it took here.
+    """
+    settle, main = settle_time(setting.model), _least_main(setting)
+    pilot = times.pilot_experiments * (settle + PERIODS * times.pilot_period)
+    return float(np.ceil(settle + ROUND + max(main / (1 - PILOT_TIME), main + pilot)))
 
 
 def plan_pilot(
@@ -224,15 +243,21 @@ def plan_main(
         If the machine can not be excited within its limits.
     """
     chosen: _Candidate | None = None
-    for period in _periods(setting, cycle_time, times):
-        found = _candidate(setting, noise, period, times.periods, cycle_time, wanted, offsets)
+    counts = sorted({times.periods, PERIODS}, reverse=True)  # a slower machine than was thought
+    tried = ((n, _periods(setting, cycle_time, times, n)) for n in counts)
+    count, lengths = next((one for one in tried if one[1]), (PERIODS, []))
+    for period in lengths:
+        found = _candidate(setting, noise, period, count, cycle_time, wanted, offsets)
         if chosen is None or found.loss < chosen.loss:
             chosen = found
         if chosen.reached <= 1.0 and fine_enough(chosen.period, setting.model):
             break
     if chosen is None:
         raise PlanRefusedError(
-            f"no period of the fast plan fits into {times.seconds_left:.3g} s: allow more time"
+            f"the slowest motion of this machine ({mode_band(setting.model)[0]:.3g} Hz) needs periods of "
+            f"{shortest_period(setting.model):.3g} s or more, {_least_main(setting):.3g} s of main "
+            f"experiments in all; {times.seconds_left:.3g} s were left for them: allow more time "
+            f"(--time {_enough(setting, times):.0f})"
         )
     plan = experiments_for(
         setting,
@@ -241,7 +266,7 @@ def plan_main(
         chosen.spread,
         seed,
         offsets=offsets,
-        periods=times.periods,
+        periods=count,
         lines=chosen.lines,
     )
     return PlannedFast(
@@ -252,11 +277,11 @@ def plan_main(
     )
 
 
-def _periods(setting: Setting, cycle_time: float, times: Timing) -> list[float]:
-    """Return the periods to try, s, rising, whole numbers of cycles."""
+def _periods(setting: Setting, cycle_time: float, times: Timing, count: int) -> list[float]:
+    """Return the periods to try, s, rising, whole numbers of cycles; `count` of them are run."""
     settle, least = settle_time(setting.model), shortest_period(setting.model)
-    each = (times.seconds_left - settle) / len(setting.loops) - settle
-    longest = each / times.periods * (1 + 1e-9)
+    each = (times.seconds_left - settle - cycle_time) / len(setting.loops) - settle
+    longest = each / count * (1 + 1e-9)
     shares = (*SHORTER, *np.linspace(NEARLY, 1.0, CANDIDATES))
     cycles = {int(np.floor(longest * share / cycle_time)) for share in shares}
     return [n * cycle_time for n in sorted(cycles) if n * cycle_time >= least]

@@ -57,7 +57,7 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SessionResult]:
 def test_half_a_minute_tells_every_mass_spring_and_damper(result: SessionResult) -> None:
     truth, model = result.truth, result.model
     assert truth is not None
-    assert 0.4 * SECONDS < result.machine_time < 1.001 * SECONDS
+    assert 0.4 * SECONDS < result.machine_time <= SECONDS
     for found, true in zip(model.axes, truth.axes, strict=True):
         for kind, within in WITHIN.items():
             values, wanted = getattr(found, kind), getattr(true, kind)
@@ -115,6 +115,6 @@ def test_a_pilot_whose_fit_goes_astray_is_not_followed(tmp_path) -> None:
     register(channel, simulated_machine(machine))
     try:
         options = Options(plan="fast", excitation_time=SECONDS)
-        assert workflow.measure(machine, tmp_path / "one", options) < 1.001 * SECONDS
+        assert workflow.measure(machine, tmp_path / "one", options) <= SECONDS
     finally:
         unregister(channel)

@@ -109,13 +109,43 @@ def test_behind_a_low_pass_torque_offsets_excite() -> None:
 def test_the_pilot_and_the_main_plan_fill_the_time() -> None:
     where = setting()
     noise = Noise(np.full(2, 0.004), np.full(2, 2e-6))
-    for seconds in (12.0, 20.0):
+    greedy = Wanted(1e-7, 1e-7, 1e-7, 1e-7)
+    for seconds, cycle in ((12.0, CYCLE), (20.0, CYCLE), (20.013, 0.001), (13.7, 0.005)):
         times = timing(where, seconds)
-        pilot = plan_pilot(where, CYCLE, times, 1)
-        main = plan_main(where, CYCLE, noise, times, Wanted(1e-7, 1e-7, 1e-7, 1e-7), 2)
+        pilot = plan_pilot(where, cycle, times, 1)
+        main = plan_main(where, cycle, noise, times, greedy, 2)
         total = pilot.duration + main.plan.duration
         assert 0.3 * seconds < total <= seconds
         assert main.reached > 1
+
+
+def slower(where: Setting, factor: float) -> Setting:
+    """The same axes with weaker springs: all modes lower by this factor."""
+    axes = tuple(
+        replace(axis, springs=tuple(Estimate(s.value / factor**2) for s in axis.springs))
+        for axis in where.model.axes
+    )
+    return replace(where, model=replace(where.model, axes=axes))
+
+
+def test_a_slower_machine_than_was_thought_gets_fewer_periods() -> None:
+    where, noise = setting(), Noise(np.full(2, 0.004), np.full(2, 2e-6))
+    times = timing(where, 20.0)
+    assert times.periods == 3
+    found = plan_main(slower(where, 5.0), CYCLE, noise, times, Wanted(), 2)
+    assert {one.periods for one in found.plan.experiments} == {2}
+    assert found.plan.duration <= times.seconds_left
+
+
+def test_a_time_that_is_too_short_for_a_slower_machine_is_named_with_what_is_enough() -> None:
+    where, noise = setting(), Noise(np.full(2, 0.004), np.full(2, 2e-6))
+    slow = slower(where, 15.0)
+    with pytest.raises(PlanRefusedError, match=r"slowest motion .* Hz.*--time \d+") as caught:
+        plan_main(slow, CYCLE, noise, timing(where, 12.0), Wanted(), 2)
+    enough = float(str(caught.value).rsplit("--time ", 1)[1].rstrip(")"))
+    times = timing(where, enough)  # the next run begins with the same machine as last accepted
+    plan = plan_main(slow, CYCLE, noise, times, Wanted(), 2).plan
+    assert 12.0 < plan.duration <= enough
 
 
 def test_a_modest_wish_takes_less_time() -> None:

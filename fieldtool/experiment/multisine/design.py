@@ -33,6 +33,8 @@ from fieldtool.records.model import FloatArray, MachineModel
 
 CYCLE_TIMES = (0.001, 0.002, 0.004, 0.005, 0.008, 0.01)
 """Cycle times to choose from, seconds; the shortest that fits, because every sample counts."""
+ROUND = 0.04
+"""Seconds: a whole number of each of these cycles."""
 CYCLES_A_PERIOD = 10
 """At the highest line, at least."""
 LOW, HIGH = 0.3, 1.5
@@ -101,8 +103,9 @@ def mode_band(model: MachineModel) -> tuple[float, float]:
 
 
 def settle_time(model: MachineModel) -> float:
-    """Return the seconds of run-in before the periods that count."""
-    return max(SETTLE_AT_LEAST, SETTLE_LINES / (LOW * mode_band(model)[0]))
+    """Return the seconds of run-in before the periods that count, a whole number of ROUND."""
+    seconds = max(SETTLE_AT_LEAST, SETTLE_LINES / (LOW * mode_band(model)[0]))
+    return ROUND * float(np.ceil(seconds / ROUND - 1e-9))
 
 
 def shortest_period(model: MachineModel) -> float:

@@ -9,7 +9,7 @@ and end at rest.  A bias velocity rises and ends likewise, and its way is added.
 """
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,15 +19,46 @@ from fieldtool.records.model import FloatArray
 
 IntArray = NDArray[np.int_]
 
-if TYPE_CHECKING:
-    from fieldtool.experiment.multisine.plan import MultisineExperiment
+
+class Periodic(Protocol):
+    """What an excitation needs to know of an experiment, such as a multisine."""
+
+    @property
+    def cycle_time(self) -> float:
+        """Seconds."""
+
+    @property
+    def samples(self) -> int:
+        """Cycles in a period."""
+
+    @property
+    def settle(self) -> int:
+        """Cycles of excitation before the periods that count."""
+
+    @property
+    def fade(self) -> int:
+        """Cycles in which the excitation rises."""
+
+    @property
+    def bias(self) -> FloatArray:
+        """Constant velocity, (M,), rad/s or m/s."""
+
+    @property
+    def start(self) -> FloatArray:
+        """Where it begins, from the centre, (M,), rad or m."""
+
+    def one_period(self) -> FloatArray:
+        """Return a period of displacements, shape (samples, M), rad or m, without the bias."""
+
+    def one_period_of_torque(self) -> FloatArray:
+        """Return a period of torque offsets, shape (samples, M), N m or N."""
 
 
 @dataclass(frozen=True, eq=False)
 class Excitation:
     """An experiment's excitation that may end at any cycle, in any stretch of cycles."""
 
-    experiment: "MultisineExperiment"
+    experiment: Periodic
     tables: tuple[FloatArray, FloatArray]
     """A period of displacements and of torque offsets, shape (samples, M) each."""
     end: int | None = None
@@ -36,7 +67,7 @@ class Excitation:
     """Cycles of the fade-out; 0: as many as the fade-in has."""
 
     @classmethod
-    def of(cls, experiment: "MultisineExperiment", end: int | None = None) -> "Excitation":
+    def of(cls, experiment: Periodic, end: int | None = None) -> "Excitation":
         """Return an experiment's excitation."""
         tables = (experiment.one_period(), experiment.one_period_of_torque())
         return cls(experiment, tables, end)
