@@ -254,8 +254,8 @@ def plan_main(
             break
     if chosen is None:
         raise PlanRefusedError(
-            f"the slowest motion of this machine ({mode_band(setting.model)[0]:.3g} Hz) needs periods of "
-            f"{shortest_period(setting.model):.3g} s or more, {_least_main(setting):.3g} s of main "
+            f"the slowest motion of this machine ({mode_band(setting.model)[0]:.3g} Hz) needs periods "
+            f"of {shortest_period(setting.model):.3g} s or more, {_least_main(setting):.3g} s of main "
             f"experiments in all; {times.seconds_left:.3g} s were left for them: allow more time "
             f"(--time {_enough(setting, times):.0f})"
         )
