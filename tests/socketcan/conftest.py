@@ -22,6 +22,7 @@ import pytest
 from drives.bus import open_bus
 from drives.bus.kernel_bus import KernelBus
 from drives.profile import BusProfile
+from tests.socketcan.stalls import StallMeter, run_again_if_stalled
 
 if sys.platform != "linux":
     collect_ignore_glob = ["test_*.py"]
@@ -30,6 +31,8 @@ ASKED = os.environ.get("FIELDTOOL_SOCKETCAN", "")
 MACHINE = Path(__file__).parent / "machine.yaml"
 TABLE, ARM = 11, 12
 CYCLE = 0.01
+RADIANS = 6.283185307179586 / 2**20
+"""Of one count of the simulated drives."""
 PATIENCE = 60.0
 """Seconds that a process in a slow guest may take for anything."""
 
@@ -42,6 +45,23 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
                 item.add_marker(
                     pytest.mark.skip(reason="needs vcan0 for itself: run tests/socketcan/run")
                 )
+
+
+METER = pytest.StashKey[StallMeter]()
+
+
+def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> bool | None:
+    """See that a computer that stands still is not taken for a tool that fails."""
+    if not ASKED:
+        return None
+    stash = item.config.stash
+    if METER not in stash:
+        stash[METER] = meter = StallMeter()
+        item.config.add_cleanup(meter.close)
+    terminal = item.config.pluginmanager.get_plugin("terminalreporter")
+    say = terminal.write_line if terminal else print
+    run_again_if_stalled(item, nextitem, stash[METER], say)
+    return True
 
 
 class Process:
@@ -143,6 +163,22 @@ class Listener:
         assert answer[0] & 0xE3 == 0x43, answer.hex()
         return int(struct.unpack("<" + layout, answer[4 : 4 + struct.calcsize(layout)])[0])
 
+    def wait_for_motion(self, master: Process, node: int, rows: int, way: float) -> None:
+        """Return when a drive has been enabled for so many SYNCs, and moved so far meanwhile, rad."""
+        self.forget()
+        places: list[float] = []
+        deadline = time.monotonic() + PATIENCE
+        while len(places) < rows or max(places) - min(places) < way:
+            assert not master.ended(), f"it ended with {master.code}:\n{master.text}"
+            assert time.monotonic() < deadline, f"node {node} does not move:\n{master.text}"
+            message = self.bus.recv(0.5)
+            if message is not None and message.arbitration_id == 0x180 + node:
+                statusword, position = struct.unpack_from("<Hi", message.data)
+                if statusword & 0x6F == 0x27:
+                    places.append(position * RADIANS)
+                else:
+                    places.clear()
+
     def statusword(self, node: int) -> int:
         return self.read(node, 0x6041, layout="H")
 
@@ -150,8 +186,7 @@ class Listener:
         return self.statusword(node) & 0x6F == 0x27
 
     def position(self, node: int) -> float:
-        """Radians, of the simulated drives' 2**20 counts a revolution."""
-        return self.read(node, 0x6064, layout="i") * 6.283185307179586 / 2**20
+        return self.read(node, 0x6064, layout="i") * RADIANS
 
 
 @pytest.fixture

@@ -28,7 +28,7 @@ SPEED = 1.0
 
 
 def swing(sync: str = "host", forever: float = 60.0) -> None:
-    """Connect, enable both axes and move them, until something ends it."""
+    """Connect, enable both axes and move them about the middle, until something ends it."""
     machine = load_machine(MACHINE)
     bus = machine.bus.model_copy(update={"sync": sync})
     machine = machine.model_copy(update={"bus": bus})
@@ -44,7 +44,8 @@ def swing(sync: str = "host", forever: float = 60.0) -> None:
             t = CYCLE * (rows + 1 + np.arange(10))
             rows += 10
             swung = 0.4 * np.sin(SPEED / 0.4 * t) * np.minimum(t, 1.0)
-            return start + np.column_stack([swung, -swung])
+            back = 0.5 + 0.5 * np.cos(np.pi * np.minimum(t / 4.0, 1.0))
+            return np.outer(back, start) + np.column_stack([swung, -swung])
 
         motion.stream(source)
 
@@ -79,6 +80,7 @@ def test_sigkill_in_motion_stops_every_drive_by_its_own_heartbeat_consumer(
     print(f"killed {wait:.3f} s into the motion")
     master = start(lambda: swing(sync))
     master.wait_for("MOVING")
+    listener.wait_for_motion(master, TABLE, rows=10, way=0.001)
     time.sleep(wait)
     assert listener.enabled(TABLE), master.text
     assert listener.enabled(ARM), master.text
@@ -97,11 +99,15 @@ def test_sigkill_in_motion_stops_every_drive_by_its_own_heartbeat_consumer(
     assert_still(listener)
 
 
+def in_the_pilot(master, listener) -> None:
+    """Return about two seconds after the pilot experiment, of nine, began to move the axes."""
+    master.wait_for("experiment 1/1: pilot")
+    listener.wait_for_motion(master, TABLE, rows=200, way=0.02)
+
+
 def test_sigkill_of_the_tool_in_a_sweep(drives, listener, start, tmp_path) -> None:
     master = start(lambda: main(["measure", str(MACHINE), "--yes", "--out", str(tmp_path / "s")]))
-    master.wait_for("Measure, pilot")
-    time.sleep(3.0)
-    assert listener.enabled(TABLE)
+    in_the_pilot(master, listener)
     listener.forget()
     heard = listener.heard(0.1)
     master.kill()
@@ -119,7 +125,7 @@ def test_a_host_that_stands_still_finds_stopped_drives_and_says_so(
     """A kernel that gives the SYNC does not go on without the host."""
     master = start(lambda: swing(sync))
     master.wait_for("MOVING")
-    time.sleep(1.0)
+    listener.wait_for_motion(master, TABLE, rows=100, way=0.05)
     listener.forget()
     heard = listener.heard(0.1)
     os.kill(master.pid, signal.SIGSTOP)
@@ -141,8 +147,7 @@ def test_an_interface_that_goes_down_in_a_sweep(
     """Exit code 4, the reason in words, raw data kept, and the drives stop by themselves."""
     out = tmp_path / "session"
     master = start(lambda: main(["measure", str(MACHINE), "--yes", "--out", str(out)]))
-    master.wait_for("Measure, pilot")
-    time.sleep(4.0)
+    in_the_pilot(master, listener)
     link("vcan0", "down")
     assert master.join() == 4, master.text
     assert "interface vcan0 is down" in master.text

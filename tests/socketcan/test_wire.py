@@ -6,6 +6,7 @@ import shutil
 import signal
 import subprocess
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ import pytest
 
 from drives.canopen_drive import connect
 from drives.profile import load_machine
-from tests.socketcan.conftest import ARM, CYCLE, MACHINE, TABLE
+from tests.socketcan.conftest import ARM, CYCLE, MACHINE, PATIENCE, TABLE, Listener
 
 FOREIGN = Path(__file__).parent / "foreign"
 FRAME = re.compile(r"\((\d+\.\d+)\) vcan0 ([0-9A-F]{3})#([0-9A-F]*)")
@@ -23,26 +24,48 @@ START, PRE_OPERATIONAL = ("000", "01{:02X}"), ("000", "80{:02X}")
 class Candump:
     """``candump -L vcan0``, into a file."""
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
+    LAST = "7FE"
+    """Identifier of a frame that nobody else sends: what came before it is in the file."""
+
+    def __init__(self, path: Path, listener: Listener) -> None:
+        self._path, self._listener = path, listener
         self._file = path.open("wb")
+        before = self._sockets()
         self._process = subprocess.Popen(["candump", "-L", "vcan0"], stdout=self._file)
-        time.sleep(0.3)
+        self._wait(lambda: self._sockets() > before)
+
+    @staticmethod
+    def _sockets() -> int:
+        """Return how many sockets hear every frame of the interface."""
+        table = Path("/proc/net/can/rcvlist_all").read_text()
+        return sum(line.split()[:1] == ["vcan0"] for line in table.splitlines())
+
+    @staticmethod
+    def _wait(done: Callable[[], bool]) -> None:
+        deadline = time.monotonic() + PATIENCE
+        while not done():
+            assert time.monotonic() < deadline, "candump hears nothing"
+            time.sleep(0.01)
+
+    def _frames(self) -> list[tuple[float, str, str]]:
+        return [(float(t), i, d) for t, i, d in FRAME.findall(self._path.read_text())]
 
     def stop(self) -> list[tuple[float, str, str]]:
         """Return time, identifier and data of every frame."""
-        time.sleep(0.3)
-        self._process.send_signal(signal.SIGINT)
-        self._process.wait(10.0)
-        self._file.close()
-        return [(float(t), i, d) for t, i, d in FRAME.findall(self._path.read_text())]
+        if self._process.poll() is None:
+            self._listener.send(int(self.LAST, 16))
+            self._wait(lambda: any(i == self.LAST for _, i, _ in self._frames()))
+            self._process.send_signal(signal.SIGINT)
+            self._process.wait(10.0)
+            self._file.close()
+        return [frame for frame in self._frames() if frame[1] != self.LAST]
 
 
 @pytest.fixture
-def candump(tmp_path):
+def candump(tmp_path, listener):
     if shutil.which("candump") is None:
         pytest.skip("needs candump (can-utils)")
-    started = Candump(tmp_path / "frames.log")
+    started = Candump(tmp_path / "frames.log", listener)
     yield started
     started.stop()
 
