@@ -11,7 +11,7 @@ from rich.table import Table
 from rich.text import Text
 
 from fieldtool import workflow
-from fieldtool.cli.output import console_of, print_json
+from fieldtool.cli.output import Json, console_of, print_json
 from fieldtool.criticise.criticism import Cause, Criticism
 
 STYLES = {
@@ -33,14 +33,18 @@ def criticise(
     picture: Annotated[
         Path | None, typer.Option("--picture", help="Draw the errors before and after (FILE.png).")
     ] = None,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print one JSON object and nothing else.")
-    ] = False,
+    report: Annotated[
+        Path | None,
+        typer.Option(
+            "--report", help="Write the report too (FILE.html); a session folder gets its own."
+        ),
+    ] = None,
+    as_json: Json = False,
 ) -> None:
     """Say what the simulation of a recording gets wrong, name causes, measure the gain."""
     console = console_of(as_json)
     with SearchBar(console) as bar:
-        found = workflow.criticise(source, model, picture, bar)
+        found = workflow.criticise(source, model, picture, bar, report)
     show_criticism(console, found.criticism)
     if as_json:
         print_json(

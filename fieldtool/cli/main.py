@@ -35,9 +35,10 @@ from fieldtool import workflow
 from fieldtool.cli.bus_options import Bitrate, Channel, Interface, on_bus
 from fieldtool.cli.check import check
 from fieldtool.cli.criticise import criticise
-from fieldtool.cli.output import console_of, print_json
+from fieldtool.cli.output import Json, console_of, print_json
 from fieldtool.cli.profile import profile_app
 from fieldtool.cli.replay import replay_command
+from fieldtool.cli.report import report
 from fieldtool.cli.restored import show_restored
 from fieldtool.cli.scan import scan
 from fieldtool.cli.screen import (
@@ -88,7 +89,6 @@ Machine = Annotated[str, typer.Argument(help="Name of a machine profile, or path
 Out = Annotated[
     Path | None, typer.Option("--out", help="Session folder; a new one in sessions/ otherwise.")
 ]
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")]
 Yes = Annotated[bool, typer.Option("--yes", help="Do not ask before moving and writing.")]
 Store = Annotated[
     bool, typer.Option("--store", help="Keep the new parameters in non-volatile memory too.")
@@ -512,6 +512,7 @@ app.add_typer(profile_app, name="profile")
 app.command()(check)
 app.command("replay")(replay_command)
 app.command()(criticise)
+app.command()(report)
 
 
 def _lengths(masses: Sequence[str]) -> dict[str, int]:

@@ -3,10 +3,13 @@
 import json
 import sys
 from collections.abc import Mapping
-from typing import Any
+from typing import Annotated, Any
 
+import typer
 from rich.console import Console
 
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")]
+"""Option of every command that can answer a program."""
 WIDTH = 120
 """Columns where there is no terminal."""
 

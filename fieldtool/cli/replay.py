@@ -13,7 +13,7 @@ from rich.text import Text
 from drives.objects import ObjectAddress
 from drives.profile import MachineProfile
 from drives.replay import Decoded
-from fieldtool.cli.output import console_of, print_json
+from fieldtool.cli.output import Json, console_of, print_json
 from fieldtool.cli.screen import TerminalScreen
 from fieldtool.cli.stop_key import stop_key
 from fieldtool.cli.tracing import unused
@@ -60,9 +60,7 @@ def replay_command(
     out: Annotated[
         Path | None, typer.Option("--out", help="Folder for what --again makes.")
     ] = None,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print one JSON object and nothing else.")
-    ] = False,
+    as_json: Json = False,
 ) -> None:
     """Show a session again from its trace: what every frame meant, and what they amount to."""
     console = console_of(as_json)

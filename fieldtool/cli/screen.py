@@ -1,7 +1,6 @@
 """What a session looks like on a terminal: where it is, how long it will take, what it found."""
 
 from collections.abc import Callable, Mapping, Sequence
-from itertools import zip_longest
 from time import perf_counter
 from types import TracebackType
 from typing import Any
@@ -19,22 +18,11 @@ from fieldtool.experiment.multisine.runner import MultisineProgress
 from fieldtool.experiment.stepped.plan import SweepPlan
 from fieldtool.experiment.stepped.runner import Progress
 from fieldtool.identify.likelihood.expected import Expected
-from fieldtool.records.model import Estimate, Kind, MachineModel
+from fieldtool.records.model import MachineModel
+from fieldtool.report.numbers import UNITS, ModelNumber, model_numbers
 from fieldtool.workflow import SessionResult, parameter_table
 from fieldtool.workflow.planning import PlannedFast
 from fieldtool.writeback.transaction import WriteBack
-
-UNITS = {
-    "rotary": {
-        "mass": "kg m2",
-        "spring": "N m/rad",
-        "damper": "N m s/rad",
-        "position": "rad",
-        "torque": "N m",
-    },
-    "linear": {"mass": "kg", "spring": "N/m", "damper": "N s/m", "position": "m", "torque": "N"},
-}
-
 
 Ask = Callable[[str], bool]
 WIDE = 110
@@ -252,23 +240,10 @@ def _clock(seconds: float) -> str:
     return f"{minutes} min {rest:02d} s" if minutes else f"{rest} s"
 
 
-def units_of(kind: Kind, torque_unit: str) -> dict[str, str]:
-    """Return the units of masses, springs and dampers for a torque in N m, N, or A (motor current)."""
-    if torque_unit != "A":
-        return UNITS[kind]
-    position = UNITS[kind]["position"]
-    return {
-        "mass": f"A s2/{position}",
-        "spring": f"A/{position}",
-        "damper": f"A s/{position}",
-        "position": position,
-    }
-
-
 def model_table(
     model: MachineModel, truth: MachineModel | None, torque_units: Sequence[str] = ()
 ) -> Table:
-    """Return masses, springs, dampers and couplings with their 95 % intervals.
+    """Return all numbers of a model with their 95 % intervals.
 
     Parameters
     ----------
@@ -277,85 +252,29 @@ def model_table(
     torque_units
         One an axis; N m or N where left out.
     """
-    units = [
-        units_of(axis.kind, torque_units[k] if torque_units else "")
-        for k, axis in enumerate(model.axes)
-    ]
     table = Table(box=None, padding=(0, 1))
     for title in ("axis", "what", "value", "± (95 %)", "unit"):
         _column(table, title, words=title in ("axis", "what", "unit"))
+    true: dict[tuple[str, str], float] = {}
     if truth is not None:
         _column(table, "simulated truth", words=False)
         _column(table, "error", words=False)
-    for k, axis in enumerate(model.axes):
-        true_axis = truth.axes[k] if truth else None
-        for what, plural in (
-            ("mass", "masses"),
-            ("spring", "springs"),
-            ("damper", "dampers"),
-        ):
-            values: Sequence[Estimate] = getattr(axis, plural)
-            known: Sequence[Estimate | None] = (
-                getattr(true_axis, plural) if true_axis else [None] * len(values)
-            )
-            for j, (value, true) in enumerate(zip_longest(values, known[: len(values)])):
-                _row(table, axis.name, f"{what} {j + 1}", value, units[k][what], true, truth)
-        for what, friction in (
-            ("viscous friction, motor", axis.viscous_friction),
-            ("viscous friction, load", axis.load_friction),
-        ):
-            if friction.value != 0.0:
-                true_friction = None
-                if true_axis is not None:
-                    true_friction = (
-                        true_axis.load_friction if "load" in what else true_axis.viscous_friction
-                    )
-                _row(
-                    table,
-                    axis.name,
-                    what,
-                    friction,
-                    units[k]["damper"],
-                    true_friction,
-                    truth,
-                )
-    true_couplings: Mapping[tuple[str, ...], float] = (
-        {tuple(sorted(c.axes)): c.value for c in truth.couplings} if truth else {}
-    )
-    for c in model.couplings:
-        true_value = true_couplings.get(tuple(sorted(c.axes)), 0.0) if truth else None
-        _row(
-            table,
-            " - ".join(c.axes),
-            "coupling",
-            Estimate(c.value, c.std),
-            units[0]["mass"],
-            Estimate(true_value) if true_value is not None else None,
-            truth,
-        )
-    for effect in model.effects:
-        words = str(effect["effect"]).replace("_", " ")
-        for name, found in effect["parameters"].items():
-            value = Estimate(float(found["value"]), float(found.get("std", float("nan"))))
-            _row(table, str(effect["axis"]), f"{words}, {name}", value, found["unit"], None, truth)
+        true = {_place(n): n.value.value for n in model_numbers(truth)}
+    for n in model_numbers(model, torque_units):
+        cells = [n.axis, n.what, f"{n.value.value:.5g}", n.interval, n.unit]
+        known = true.get(_place(n))
+        if truth is not None and known is None and n.what == "coupling":
+            known = 0.0
+        if known is not None:
+            error = f"{100 * (n.value.value / known - 1):+.2f} %" if known else ""
+            cells += [f"{known:g}", error]
+        _add(table, *cells)
     return table
 
 
-def _row(
-    table: Table,
-    axis: str,
-    what: str,
-    value: Estimate,
-    unit: str,
-    true: Estimate | None,
-    truth: MachineModel | None,
-) -> None:
-    interval = f"{1.96 * value.std:.2g}" if value.std == value.std else "not known"
-    cells = [axis, what, f"{value.value:.5g}", interval, unit]
-    if truth is not None and true is not None:
-        error = f"{100 * (value.value / true.value - 1):+.2f} %" if true.value else ""
-        cells += [f"{true.value:g}", error]
-    _add(table, *cells)
+def _place(number: ModelNumber) -> tuple[str, str]:
+    """What tells a number from all others; two axes in either order."""
+    return " - ".join(sorted(number.axis.split(" - "))), number.what
 
 
 def parameter_rows(
@@ -393,7 +312,8 @@ def show_result(console: Console, result: SessionResult) -> None:
     console.print(
         Text(
             f"\nMachine time {_clock(result.machine_time)}, wall time {_clock(result.wall_time)}. "
-            f"Everything is in {result.folder}; responses.png there shows measurement and model."
+            f"Everything is in {result.folder}; report.html there, opened in a browser, shows "
+            "what was found."
         )
     )
 

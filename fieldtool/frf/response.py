@@ -3,7 +3,8 @@
 Layout of the file (HDF5, format ``fieldtool-frequency-response/1``): group ``responses`` with one
 group ``0000``, ... per response: attributes ``name``, ``condition``, ``axes``; datasets
 ``frequencies`` (F,), ``response`` (F, M, M) as pairs r, i, ``std`` (F, M, M), and, where errors of
-the elements go together, ``covariance`` (F, M*M, M*M) as pairs r, i.
+the elements go together, ``covariance`` (F, M*M, M*M) as pairs r, i.  Where a model was fitted, group
+``band`` with ``frequencies`` (B,) and ``relative_std`` (B, M, M).
 """
 
 from collections.abc import Mapping
@@ -99,8 +100,20 @@ class FrequencyResponse:
         return range(len(self.axes))[axis]
 
 
-def save_responses(responses: Mapping[str, FrequencyResponse], path: Path | str) -> None:
-    """Write named responses to one file, in one step.
+@dataclass(frozen=True, eq=False)
+class ModelBand:
+    """How well the response of a fitted model is known."""
+
+    frequencies: FloatArray
+    """(B,), Hz."""
+    relative_std: FloatArray
+    """(B, M, M): standard error of the logarithm of the size."""
+
+
+def save_responses(
+    responses: Mapping[str, FrequencyResponse], path: Path | str, band: ModelBand | None = None
+) -> None:
+    """Write named responses to one file, in one step, with the band of the model fitted to them.
 
     Raises
     ------
@@ -121,6 +134,10 @@ def save_responses(responses: Mapping[str, FrequencyResponse], path: Path | str)
             put(group, "std", response.std)
             if response.covariance is not None:
                 put(group, "covariance", response.covariance)
+        if band is not None:
+            group = file.root.create_group("band")
+            put(group, "frequencies", band.frequencies)
+            put(group, "relative_std", band.relative_std)
         file.write(path)
     finally:
         file.close()
@@ -142,6 +159,25 @@ def load_responses(path: Path | str) -> dict[str, FrequencyResponse]:
         except (OSError, RuntimeError) as error:
             raise FileFormatError(path, f"is damaged ({error}).") from error
     return dict(found)
+
+
+def load_band(path: Path | str) -> ModelBand | None:
+    """Return the band of the model in the file ``path``; None where it holds none.
+
+    Raises
+    ------
+    FileFormatError
+        As :func:`load_responses`.
+    """
+    with opened(path, FORMAT) as reader:
+        if "band" not in reader.group:
+            return None
+        held = reader.child("band")
+        frequencies = held.array("frequencies", np.float64, 1)
+        relative_std = held.array("relative_std", np.float64, 3)
+        if relative_std.shape[0] != frequencies.size:
+            raise held.fault("frequencies and relative_std are not of one length.")
+        return ModelBand(frequencies, relative_std)
 
 
 def _read(reader: Reader) -> tuple[str, FrequencyResponse]:

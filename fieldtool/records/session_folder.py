@@ -6,7 +6,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from fieldtool.errors import OutputError
+from fieldtool.errors import FileFormatError, OutputError
 
 
 @dataclass(frozen=True)
@@ -35,6 +35,30 @@ class SessionFolder:
                 "with --out. Nothing was moved."
             ) from error
         return cls(path)
+
+    @classmethod
+    def existing(cls, path: Path) -> "SessionFolder":
+        """Return a folder that holds something of a session.
+
+        Raises
+        ------
+        FileFormatError
+            If there is no such folder, or nothing of a session is in it.
+        """
+        folder = cls(path)
+        if not path.exists():
+            raise FileFormatError(
+                path, "does not exist. Give the folder of a session (--out of a run)."
+            )
+        if not path.is_dir():
+            raise FileFormatError(path, "is a file. Give the folder of a session.")
+        if not any(p.is_file() for p in (folder.machine, folder.recording, folder.events)):
+            raise FileFormatError(
+                path,
+                "is no session folder: neither machine.yaml nor recording.h5 is in it. "
+                "`fieldtool run` and `fieldtool measure` make one.",
+            )
+        return folder
 
     @property
     def machine(self) -> Path:
@@ -70,6 +94,16 @@ class SessionFolder:
     def criticism_picture(self) -> Path:
         """The errors before and after."""
         return self.path / "criticism.png"
+
+    @property
+    def views(self) -> Path:
+        """The errors before and after, as numbers."""
+        return self.path / "criticism-views.h5"
+
+    @property
+    def report(self) -> Path:
+        """Everything on one page."""
+        return self.path / "report.html"
 
     @property
     def tuning(self) -> Path:

@@ -1,5 +1,6 @@
 """What the simulation gets wrong, before and after, as one PNG: a row of pictures an axis."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -7,22 +8,29 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from fieldtool.criticise.criticise import Criticised
-from fieldtool.criticise.effects.base import Context, FloatArray
+from fieldtool.criticise.criticism import Criticism
+from fieldtool.criticise.pictures_file import Picture
 from fieldtool.errors import OutputError
 
-BEFORE, AFTER, MEASURED = "#d1495b", "#1f3b73", "#9aa5b1"
-SHOWN_ROWS = 4000
-"""Rows of the course in time that are drawn."""
-BINS = 30
+COLORS = {
+    "measured torque": "#9aa5b1",
+    "error": "#d1495b",
+    "error before": "#d1495b",
+    "error after": "#1f3b73",
+    "noise": "#c9a227",
+}
+COLUMNS = ("time", "frequency", "velocity", "position")
 
 
-def draw_criticism(criticised: Criticised, path: Path) -> None:
+def draw_criticism(criticism: Criticism, pictures: Sequence[Picture], path: Path) -> None:
     """Draw the torque's error of every axis in time, by frequency, by velocity and by position.
 
     Parameters
     ----------
-    criticised : Criticised
+    criticism : Criticism
+        For the heading.
+    pictures : sequence of Picture
+        Of every axis.
     path : Path
         PNG file to write.
 
@@ -31,80 +39,37 @@ def draw_criticism(criticised: Criticised, path: Path) -> None:
     OutputError
         If the file can not be written.
     """
-    found = criticised.found
-    contexts = [found.prepared.context(f.hypothesis) for f in (found.before, found.after)]
-    axes = contexts[0].axes
+    axes = list(dict.fromkeys(p.axis for p in pictures))
     figure = Figure(figsize=(16, 1 + 3.2 * len(axes)), layout="constrained")
-    grid = figure.subplots(len(axes), 4, squeeze=False)
-    for k, info in enumerate(axes):
-        _in_time(grid[k][0], contexts, k)
-        _by_frequency(grid[k][1], contexts, k)
-        _binned(grid[k][2], contexts, k, "velocity", f"velocity, {info.position_unit}/s")
-        _binned(grid[k][3], contexts, k, "position", f"position, {info.position_unit}")
-        grid[k][0].set_ylabel(f"{info.name}: torque, {info.torque_unit}")
+    FigureCanvasAgg(figure)
+    grid = figure.subplots(len(axes), len(COLUMNS), squeeze=False)
+    for row, axis in zip(grid, axes, strict=True):
+        for plot, kind in zip(row, COLUMNS, strict=True):
+            for picture in pictures:
+                if picture.axis == axis and picture.kind == kind:
+                    _draw(plot, picture)
+        row[0].set_ylabel(f"{axis}: {row[0].get_ylabel()}")
     grid[0][0].legend(fontsize=8, loc="upper right")
-    names = ", ".join(f"{c.effect} ({c.axis_words})" for c in criticised.criticism.causes)
-    figure.suptitle(f"{criticised.criticism.verdict}: {names or 'no cause named'}", fontsize=11)
+    names = ", ".join(f"{c.effect} ({c.axis_words})" for c in criticism.causes)
+    figure.suptitle(f"{criticism.verdict}: {names or 'no cause named'}", fontsize=11)
     try:
-        FigureCanvasAgg(figure)
         figure.savefig(path, dpi=100)
     except OSError as error:
         raise OutputError(f"{path} can not be written ({error.strerror}).") from error
 
 
-def _in_time(axes: Axes, contexts: list[Context], axis: int) -> None:
-    """The experiment with the largest error, its middle."""
-    sizes = [float(np.sum(e[:, axis] ** 2)) for e in contexts[0].errors]
-    k = int(np.argmax(sizes))
-    motion = contexts[0].motions[k]
-    begin = max(0, (motion.rows - SHOWN_ROWS) // 2)
-    rows = slice(begin, begin + SHOWN_ROWS)
-    time = motion.clock[rows] - motion.clock[0]
-    axes.plot(time, motion.torque[rows, axis], color=MEASURED, lw=0.6, label="measured torque")
-    for context, color, label in zip(
-        contexts, (BEFORE, AFTER), ("error before", "after"), strict=True
-    ):
-        axes.plot(time, context.errors[k][rows, axis], color=color, lw=0.8, label=label)
-    axes.set_xlabel(f"time in {motion.experiment}, s")
-
-
-def _by_frequency(axes: Axes, contexts: list[Context], axis: int) -> None:
-    k = int(np.argmax([m.rows for m in contexts[0].motions]))
-    motion = contexts[0].motions[k]
-    window = np.hanning(motion.rows)
-    frequency = np.fft.rfftfreq(motion.rows, motion.step)
-    inside = (frequency > 0) & (frequency <= contexts[0].top)
-    torque = motion.torque[:, axis] - motion.torque[:, axis].mean()
-    courses = [(torque, MEASURED), (contexts[0].errors[k][:, axis], BEFORE)]
-    courses.append((contexts[1].errors[k][:, axis], AFTER))
-    for course, color in courses:
-        size = np.abs(np.fft.rfft(course * window))[inside] * 4 / motion.rows
-        axes.loglog(frequency[inside], np.maximum(size, 1e-12), color=color, lw=0.6)
-    axes.set_xlabel("frequency, Hz")
-
-
-def _binned(axes: Axes, contexts: list[Context], axis: int, what: str, label: str) -> None:
-    """Mean of the error in bins of velocity or position, with its standard error."""
-    for context, color in zip(contexts, (BEFORE, AFTER), strict=True):
-        values = np.concatenate([_signal(m, what)[:, axis] for m in context.motions])
-        error = np.concatenate([e[:, axis] for e in context.errors])
-        counted = np.concatenate([m.counted[:, axis] for m in context.motions]) > 0
-        centre, mean, std = _means(values[counted], error[counted])
-        axes.errorbar(centre, mean, std, color=color, lw=1, marker=".", ms=3, elinewidth=0.6)
-    axes.axhline(0.0, color=MEASURED, lw=0.5)
-    axes.set_xlabel(label)
-
-
-def _signal(motion: object, what: str) -> FloatArray:
-    return np.asarray(getattr(motion, f"smooth_{what}"), dtype=np.float64)
-
-
-def _means(values: FloatArray, error: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    edges = np.linspace(values.min(), values.max(), BINS + 1)
-    place = np.clip(np.searchsorted(edges, values) - 1, 0, BINS - 1)
-    count = np.bincount(place, minlength=BINS)
-    full = count >= 10
-    mean = np.bincount(place, error, BINS)[full] / count[full]
-    square = np.bincount(place, error**2, BINS)[full] / count[full]
-    std = np.sqrt(np.maximum(square - mean**2, 0.0) / count[full])
-    return (edges[1:] + edges[:-1])[full] / 2, mean, std
+def _draw(plot: Axes, picture: Picture) -> None:
+    for series in picture.series:
+        color = COLORS.get(series.label, "black")
+        if series.std is not None:
+            plot.errorbar(
+                series.x, series.y, series.std, color=color, lw=1, marker=".", ms=3, elinewidth=0.6
+            )
+        elif picture.logarithmic:
+            plot.loglog(series.x, np.maximum(series.y, 1e-12), color=color, lw=0.6)
+        else:
+            plot.plot(series.x, series.y, color=color, lw=0.7, label=series.label)
+    if not picture.logarithmic:
+        plot.axhline(0.0, color=COLORS["measured torque"], lw=0.5)
+    plot.set_xlabel(picture.x)
+    plot.set_ylabel(picture.y, fontsize=8)

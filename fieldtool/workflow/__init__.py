@@ -10,6 +10,7 @@ from fieldtool.workflow.fast_measuring import plan
 from fieldtool.workflow.models import prior_model, truth_model
 from fieldtool.workflow.next_plan import next_plan
 from fieldtool.workflow.recordings import compare, export_folder, import_folder, simulate
+from fieldtool.workflow.reporting import report
 from fieldtool.workflow.session import (
     Options,
     Quiet,
@@ -38,6 +39,7 @@ __all__ = [
     "plan",
     "prior_model",
     "redesign",
+    "report",
     "restore",
     "run",
     "simulate",

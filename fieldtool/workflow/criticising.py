@@ -8,6 +8,8 @@ from drives.errors import UserStopError
 from drives.profile import load_machine
 from fieldtool.criticise.criticise import Criticised, criticise
 from fieldtool.criticise.criticism import Criticism
+from fieldtool.criticise.pictured import pictures_of
+from fieldtool.criticise.pictures_file import save_pictures
 from fieldtool.errors import NotEnoughDataError
 from fieldtool.identify.recorded import identify_recording
 from fieldtool.records.model import MachineModel
@@ -17,6 +19,8 @@ from fieldtool.records.session_folder import SessionFolder
 from fieldtool.records.yaml_file import write_yaml
 from fieldtool.report.criticism_picture import draw_criticism
 from fieldtool.workflow.models import prior_model
+from fieldtool.workflow.reporting import report as write_report
+from fieldtool.workflow.reporting import report_of_recording
 from fieldtool.workflow.session import Session
 
 Advance = Callable[[str, float], None]
@@ -29,6 +33,7 @@ def criticise_source(
     model_file: Path | None = None,
     picture: Path | None = None,
     advance: Advance = lambda *_: None,
+    report: Path | None = None,
 ) -> Criticised:
     """Criticise the model of a session folder, or of a recording.
 
@@ -42,6 +47,8 @@ def criticise_source(
         PNG file to draw; a session folder always gets one.
     advance : callable
         Told what is done, and a number from 0 to 1.
+    report : Path, optional
+        HTML file to write; a session folder always gets its ``report.html``.
 
     Raises
     ------
@@ -65,8 +72,13 @@ def criticise_source(
     found = criticise(recording, model, _alike(prior, model), advance=advance)
     if folder:
         keep(folder, found, model)
+        write_report(source)
     if picture is not None:
-        draw_criticism(found, picture)
+        draw_criticism(found.criticism, pictures_of(found.found), picture)
+    if report is not None and folder:
+        write_report(source, report)
+    elif report is not None:
+        report_of_recording(source, found, recording, report)
     return found
 
 
@@ -121,7 +133,9 @@ def cause_sentences(criticism: Criticism) -> tuple[str, ...]:
 def keep(folder: SessionFolder, found: Criticised, model: MachineModel) -> None:
     """Write the criticism and its picture; where a cause is new, the extended model as well."""
     write_yaml(folder.criticism, found.criticism.as_dict())
-    draw_criticism(found, folder.criticism_picture)
+    pictures = pictures_of(found.found)
+    save_pictures(pictures, folder.views)
+    draw_criticism(found.criticism, pictures, folder.criticism_picture)
     extended = final_model(found, model)
     if extended is not model:
         write_model(extended, folder.model)

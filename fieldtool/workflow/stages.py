@@ -5,6 +5,8 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 
+import numpy as np
+
 from drives.bus import not_imitated
 from drives.canopen_drive import CanopenGroup, connect
 from drives.canopen_drive.group import profile_of
@@ -19,7 +21,8 @@ from fieldtool.errors import (
     IdentificationError,
     NotEnoughDataError,
 )
-from fieldtool.frf.response import save_responses
+from fieldtool.frf.response import ModelBand, save_responses
+from fieldtool.identify.likelihood.model_band import relative_std
 from fieldtool.identify.recorded import Identified, identify_recording
 from fieldtool.records.model import Estimate, MachineModel
 from fieldtool.records.model_file import read_model, write_model
@@ -38,6 +41,7 @@ from fieldtool.workflow.models import (
     prior_model,
     truth_model,
 )
+from fieldtool.workflow.reporting import report
 from fieldtool.workflow.session import (
     Options,
     Quiet,
@@ -46,12 +50,15 @@ from fieldtool.workflow.session import (
     SessionResult,
     never,
     open_session,
+    parameter_table,
 )
 from fieldtool.writeback.restoring import Restored, bring_back, source_of
 from fieldtool.writeback.transaction import WriteBack, apply, changes_for
 
 NOT_KNOWN = 0.3
 """Relative standard error of a mass or spring from which no controller is designed."""
+BAND_POINTS = 400
+"""Frequencies at which the band of the model's response is kept."""
 DATA_SHEET_APART = 4.0
 """Tolerances of a motor's inertia that the identified first mass may be apart without a word."""
 Confirm = Callable[[Sequence[Change]], bool]
@@ -90,22 +97,31 @@ def run(
     """
     options = options or Options()
     begin = time.perf_counter()
-    with open_session(machine, out, screen, stop_requested, command="run", options=options) as (
-        session,
-        group,
-    ):
-        machine_time = _measured(session, group, options)
-        identified = _identify(session, options)
-        session.screen.found(identified.model, truth_model(session.machine))
-        model, criticism = criticised(session, identified.model, stop_requested)
-        session.screen.stage("Design new controller parameters")
-        tuning = _design(session.folder, session.machine, model)
-        session.screen.designed(tuning)
-        if stop_requested():
-            raise UserStopError(
-                "stopped by the user before anything was written; no axis was moving"
-            )
-        write_back = _write(session, group, tuning, options, confirm)
+    opened: Session | None = None
+    try:
+        with open_session(machine, out, screen, stop_requested, command="run", options=options) as (
+            session,
+            group,
+        ):
+            opened = session
+            machine_time = _measured(session, group, options)
+            identified = _identify(session, options)
+            session.screen.found(identified.model, truth_model(session.machine))
+            model, criticism = criticised(session, identified.model, stop_requested)
+            session.screen.stage("Design new controller parameters")
+            tuning = _design(session.folder, session.machine, model)
+            session.screen.designed(tuning)
+            if stop_requested():
+                raise UserStopError(
+                    "stopped by the user before anything was written; no axis was moving"
+                )
+            write_back = _write(session, group, tuning, options, confirm)
+    except BaseException:
+        if opened is not None and opened.folder.recording.is_file():
+            with suppress(Exception):  # nothing may hide why it ended
+                report(opened.folder.path)
+        raise
+    _reported(session)
     return SessionResult(
         session.folder.path,
         identified.model,
@@ -290,6 +306,14 @@ def restore(
         )
 
 
+def _reported(session: Session) -> None:
+    """Write the report; a full disk does not undo what was done."""
+    try:
+        report(session.folder.path)
+    except FieldtoolError as error:
+        session.warn(f"The report was not written: {error}")
+
+
 def _measured(session: Session, group: CanopenGroup, options: Options) -> float:
     try:
         if options.plan == "fast":
@@ -348,7 +372,7 @@ def _against_data_sheet(session: Session, model: MachineModel) -> list[str]:
 
 
 def _keep(folder: SessionFolder, identified: Identified, prior: MachineModel | None) -> None:
-    save_responses(identified.responses, folder.frequency_response)
+    save_responses(identified.responses, folder.frequency_response, _band(identified))
     write_model(identified.model, folder.model)
     if identified.responses:
         draw_responses(
@@ -360,6 +384,15 @@ def _keep(folder: SessionFolder, identified: Identified, prior: MachineModel | N
             identified.torque_units,
         )
     folder.note("identified", notes=list(identified.notes))
+
+
+def _band(identified: Identified) -> ModelBand | None:
+    """Return how well the fitted model's response is known, over the measured band and a little more."""
+    if identified.fitted is None or not identified.responses:
+        return None
+    lines = np.concatenate([r.frequencies for r in identified.responses.values()])
+    grid = np.geomspace(0.9 * lines.min(), 1.1 * lines.max(), BAND_POINTS)
+    return ModelBand(grid, relative_std(identified.fitted, 2 * np.pi * grid))
 
 
 def check_known(model: MachineModel) -> None:
@@ -404,7 +437,9 @@ def _write(
         except NotSupportedError as error:  # a drive whose gains are for its maker's software
             session.warn(str(error))
             changes = ()
-        return WriteBack((), changes, in_memory=False, stored=False, backup=None)
+        designed = WriteBack((), changes, in_memory=False, stored=False, backup=None)
+        folder.note("parameters", rows=parameter_table(designed))
+        return designed
     session.screen.stage("Write the new parameters, and read them back")
     result = apply(
         session.machine.name,
@@ -415,6 +450,7 @@ def _write(
         options.store,
         session.screen.say,
     )
+    folder.note("parameters", rows=parameter_table(result))
     folder.note("write", written=result.in_memory, stored=result.stored)
     session.screen.say(result.sentence)
     return result

@@ -67,6 +67,11 @@ def views_of(context: Context, axis: int, names: Sequence[str] | None = None) ->
     return tuple(sorted(views, key=lambda v: -v.share))
 
 
+def share_with(context: Context, axis: int, other: int) -> float:
+    """Return the share of an axis' error, in power, that goes with the motion of one axis."""
+    return _share(context, axis, [_linear(m, [other]) for m in context.motions])
+
+
 def _share(context: Context, axis: int, courses: Sequence[FloatArray]) -> float:
     """Explain one half of the stretches by what fits the other half, and the other way round."""
     rows, sides, halves = [], [], []

@@ -1,0 +1,82 @@
+"""The first sentence of a report: what matters, for people who read no further."""
+
+from fieldtool.criticise.criticism import Criticism
+from fieldtool.report.material import Material
+from fieldtool.report.words import cause_words, listed, percent
+
+MEANING = {
+    "adequate": (
+        "adequate: what the simulation leaves is noise, or below 1 % of the torque, on data that no fit "
+        "has seen"
+    ),
+    "explained": (
+        "explained: the causes account for at least 90 % of the error's power beyond noise, on data "
+        "that no fit has seen"
+    ),
+    "partly explained": (
+        "partly explained: causes were found, and something is left that none of the known ones explains"
+    ),
+    "unexplained": (
+        "unexplained: the simulation is wrong by more than noise, and no known cause explains it"
+    ),
+}
+"""What the words of a criticism's verdict mean."""
+TONES = {
+    "adequate": "good",
+    "explained": "good",
+    "partly explained": "mixed",
+    "unexplained": "mixed",
+}
+
+
+def verdict(material: Material) -> tuple[str, str]:
+    """Return one plain sentence, and its tone: good, mixed or open."""
+    for name in ("verification",):
+        said = material.documents.get(name, {}).get("sentence")
+        if isinstance(said, str) and material.criticism is not None:
+            return f"{_of(material.criticism)} {said}", TONES[material.criticism.verdict]
+    if material.criticism is not None:
+        return _of(material.criticism), TONES[material.criticism.verdict]
+    stopped = _stopped(material)
+    if material.model is not None:
+        return f"The machine was identified; its simulation was not criticised.{stopped}", "open"
+    if material.recording is not None:
+        return f"The machine was measured; it was not identified.{stopped}", "open"
+    return f"Nothing was measured.{stopped}", "open"
+
+
+def _of(criticism: Criticism) -> str:
+    held = criticism.held_out
+    worst = max(held.error_before, key=lambda n: held.error_before[n].torque, default="")
+    if not worst:
+        return f"The verdict is: {MEANING[criticism.verdict]}."
+    before, after = held.error_before[worst].torque, held.error_after[worst].torque
+    noise = held.noise_floor[worst]
+    beyond = "" if noise is None else f" (noise {percent(noise)})"
+    if criticism.verdict == "adequate":
+        return (
+            f"The simulation does as the machine does: at most {percent(after)} of the torque of unseen "
+            f"data is not explained{beyond}, which is noise or does not matter."
+        )
+    if not criticism.causes:
+        return (
+            f"The simulation is wrong by {percent(before)} of the torque of {worst}{beyond}, and "
+            "none of the known causes explains it."
+        )
+    named = listed([cause_words(c) for c in criticism.causes])
+    ties = " Another cause would explain the data as well (see below)." if any(
+        c.ties for c in criticism.causes
+    ) else ""  # fmt: skip
+    how = "explains" if len(criticism.causes) == 1 else "explain"
+    partly = " in part" if criticism.verdict == "partly explained" else ""
+    return (
+        f"The simulation was wrong by {percent(before)} of the torque of {worst}; {named} {how} "
+        f"it{partly}: with it, {percent(after)} is left{beyond}.{ties}"
+    )
+
+
+def _stopped(material: Material) -> str:
+    ended = material.events_of("ended")
+    if ended and ended[-1].get("text"):
+        return f" The session ended early: {ended[-1]['text']}"
+    return ""

@@ -1,0 +1,166 @@
+"""A session folder's report: whatever is there, read and put on one page."""
+
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+
+from drives.errors import DrivesError
+from drives.profile import MachineProfile, load_machine
+from fieldtool.criticise.criticise import Criticised
+from fieldtool.criticise.criticism_file import read_criticism
+from fieldtool.criticise.pictured import pictures_of
+from fieldtool.criticise.pictures_file import load_pictures
+from fieldtool.design.tuning_file import read_tuning
+from fieldtool.errors import FieldtoolError, FileFormatError, OutputError
+from fieldtool.frf.response import load_band, load_responses
+from fieldtool.records.files import read_text
+from fieldtool.records.model import MachineModel
+from fieldtool.records.model_file import read_model
+from fieldtool.records.recording import Recording, load
+from fieldtool.records.session_folder import SessionFolder
+from fieldtool.records.yaml_file import MAX_BYTES
+from fieldtool.report.contents import page_of
+from fieldtool.report.material import Material
+from fieldtool.report.page import write_page
+from fieldtool.workflow.models import prior_model, truth_model
+
+DOCUMENTS = ("prediction", "verification")
+"""Files of later stages (``NAME.yaml``) that are shown where they are there."""
+LARGEST_LOG = 64 * 1024 * 1024
+T = TypeVar("T")
+
+
+def report(folder_path: Path, out: Path | None = None) -> Path:
+    """Write the report of a session folder, as far as the session has come; return its file.
+
+    Parameters
+    ----------
+    folder_path : Path
+    out : Path, optional
+        HTML file; ``report.html`` in the folder otherwise.
+
+    Raises
+    ------
+    FileFormatError
+        If the folder holds nothing of a session.
+    OutputError
+        If the report can not be written.
+    """
+    folder = SessionFolder.existing(folder_path)
+    out = out or folder.report
+    write_page(page_of(material_of(folder)), out)
+    return out
+
+
+def report_of_recording(source: Path, found: Criticised, recording: Recording, out: Path) -> None:
+    """Write the report of a recording's criticism, where there is no session folder.
+
+    Raises
+    ------
+    OutputError
+        If the report can not be written.
+    """
+    criticism = found.criticism
+    material = Material(
+        source.name,
+        recording=recording,
+        model=criticism.model,
+        criticism=criticism,
+        pictures=pictures_of(found.found),
+    )
+    write_page(page_of(material), out)
+
+
+def material_of(folder: SessionFolder) -> Material:
+    """Read everything that a session folder holds; what can not be read is among what is missing."""
+    missing: list[str] = []
+
+    def read(path: Path, reader: Callable[[Path], T], lacking: str) -> T | None:
+        if not path.is_file():
+            if lacking:
+                missing.append(f"{path.name}: {lacking}")
+            return None
+        try:
+            return reader(path)
+        except (FieldtoolError, DrivesError) as error:
+            missing.append(f"{path.name} can not be read: {error}")
+            return None
+
+    machine = read(folder.machine, load_machine, "the machine's profile was not kept.")
+    recording = read(folder.recording, load, "nothing was measured.")
+    responses = read(folder.frequency_response, load_responses, "")
+    model = read(
+        folder.model,
+        read_model,
+        "the machine was not identified: `fieldtool identify` on this folder.",
+    )
+    criticism = None
+    if model is not None:
+        known = model
+        criticism = read(
+            folder.criticism,
+            lambda path: read_criticism(path, known),
+            "its simulation was not criticised: `fieldtool criticise` on this folder.",
+        )
+    return Material(
+        name=folder.path.resolve().name,
+        machine=machine,
+        simulated=machine is not None and truth_model(machine) is not None,
+        prior=_prior(machine),
+        truth=truth_model(machine) if machine else None,
+        recording=recording,
+        responses=responses or {},
+        band=read(folder.frequency_response, load_band, "") if responses else None,
+        model=model,
+        criticism=criticism,
+        pictures=(read(folder.views, load_pictures, "") or ()) if criticism else (),
+        tuning=read(
+            folder.tuning,
+            read_tuning,
+            "no controller was designed: `fieldtool design` on this folder.",
+        ),
+        documents={
+            name: found
+            for name in DOCUMENTS
+            if (found := read(folder.path / f"{name}.yaml", _document, "")) is not None
+        },
+        events=_events(folder.events),
+        missing=tuple(missing),
+    )
+
+
+def _prior(machine: MachineProfile | None) -> MachineModel | None:
+    try:
+        return prior_model(machine) if machine else None
+    except DrivesError:
+        return None
+
+
+def _document(path: Path) -> Mapping[str, Any]:
+    try:
+        data = yaml.safe_load(read_text(path, MAX_BYTES))
+    except yaml.YAMLError as error:
+        raise FileFormatError(path, f"is no YAML ({' '.join(str(error).split())}).") from error
+    if not isinstance(data, Mapping):
+        raise FileFormatError(path, "holds no keys and values.")
+    return data
+
+
+def _events(path: Path) -> tuple[Mapping[str, Any], ...]:
+    """Read the log; a line that was cut off is left out."""
+    try:
+        text = read_text(path, LARGEST_LOG)
+    except (FileFormatError, OutputError):
+        return ()
+    out = []
+    for line in text.splitlines():
+        try:
+            event = json.loads(line)
+        except ValueError:
+            continue
+        if isinstance(event, dict):
+            out.append(event)
+    return tuple(out)

@@ -1,0 +1,352 @@
+"""The report: whole, inert whatever the names are, and true to what it is made from."""
+
+import base64
+import hashlib
+import json
+import re
+import shutil
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fieldtool.cli.main import main
+from fieldtool.criticise.criticise import criticise
+from fieldtool.criticise.criticism_file import read_criticism
+from fieldtool.criticise.pictured import pictures_of
+from fieldtool.criticise.pictures_file import load_pictures, save_pictures
+from fieldtool.errors import FileFormatError
+from fieldtool.records.closed_loop import AxisLoop, ClosedLoop
+from fieldtool.records.model import AxisModel, Coupling, Estimate, MachineModel
+from fieldtool.records.model_file import write_model
+from fieldtool.records.recording import AxisInfo, Controller, Experiment, Recording, save
+from fieldtool.records.session_folder import SessionFolder
+from fieldtool.records.yaml_file import write_yaml
+from fieldtool.report.page import Page, html_of
+from fieldtool.report.section import Plot, Section, Table, Words
+from fieldtool.workflow.reporting import material_of, report
+
+HOSTILE = "</script><script>alert(1)</script> \"'><img src=x onerror=alert(2)> {{7*7}} & \u2028"
+STEP, FINE, ROWS, PERIODS = 1e-3, 8, 1024, 4
+GAINS = (15.0, 1.2, 8.0)
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+CHROMIUM = next((path for name in BROWSERS if (path := shutil.which(name))), None)
+
+
+class Elements(HTMLParser):
+    """Start tags with their attributes, and the texts of scripts."""
+
+    def __init__(self):
+        super().__init__()
+        self.tags, self.scripts, self._inside = [], [], None
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append((tag, dict(attrs)))
+        if tag == "script":
+            self._inside = [dict(attrs).get("type", ""), ""]
+
+    def handle_data(self, data):
+        if self._inside is not None:
+            self._inside[1] += data
+
+    def handle_endtag(self, tag):
+        if tag == "script" and self._inside is not None:
+            self.scripts.append(tuple(self._inside))
+            self._inside = None
+
+
+def elements(html):
+    parser = Elements()
+    parser.feed(html)
+    parser.close()
+    return parser
+
+
+def page(text):
+    figure = {"data": [{"type": "scatter", "x": [1, 2], "y": [1, 2], "name": text}], "layout": {}}
+    return Page(
+        text, text, text, "good", ((text, text),), True,
+        (
+            Section(text, text, (Words((text,)), Table((text,), ((text,),)), Plot(figure, text))),
+            Section(text, text, (Words((text,), "list"), Words((text,), "command")), folded=True),
+        ),
+    )  # fmt: skip
+
+
+def assert_inert(html, text):
+    found = elements(html)
+    kinds = [kind for kind, _ in found.scripts]
+    assert kinds.count("") == 2  # the library, and what draws
+    assert kinds.count("application/json") == len(kinds) - 2
+    allowed = {"html", "head", "meta", "title", "style", "body", "main", "header", "h1", "h2", "p",
+               "dl", "dt", "dd", "nav", "a", "noscript", "section", "figure", "figcaption", "div",
+               "table", "caption", "thead", "tbody", "tr", "th", "td", "ul", "li", "pre", "details",
+               "summary", "footer", "script"}  # fmt: skip
+    assert {tag for tag, _ in found.tags} <= allowed
+    for tag, attributes in found.tags:
+        assert not {name for name in attributes if name.startswith("on")}
+        assert attributes.get("href", "#").startswith("#"), tag
+        assert "src" not in attributes
+    figures = [json.loads(body) for kind, body in found.scripts if kind]
+    assert all(f["data"][0]["name"] == text for f in figures)
+
+
+@given(text=st.text(max_size=60) | st.just(HOSTILE))
+@settings(max_examples=12, deadline=None)
+def test_no_text_becomes_anything_but_text(text):
+    text = text.replace("\x00", "").replace("\r", "")
+    assert_inert(html_of(page(text)), text)
+
+
+def test_the_policy_names_the_two_scripts_and_nothing_else():
+    html = html_of(page("plain"))
+    found = elements(html)
+    policy = next(a["content"] for t, a in found.tags if t == "meta" and "http-equiv" in a)
+    assert policy.startswith("default-src 'none'; script-src 'sha256-")
+    hashes = set(re.findall(r"'sha256-([^']+)'", policy))
+    code = [body for kind, body in found.scripts if not kind]
+    assert hashes == {base64.b64encode(hashlib.sha256(c.encode()).digest()).decode() for c in code}
+    assert "unsafe-eval" not in policy
+    assert "http" not in policy
+
+
+def numbers(*values):
+    return tuple(Estimate(v, 0.01 * v) for v in values)
+
+
+MODEL = MachineModel(
+    (
+        AxisModel(
+            "a", "rotary", numbers(0.02, 0.03), numbers(190.0), numbers(0.03), Estimate(0.02)
+        ),
+        AxisModel("b", "rotary", numbers(0.04), (), (), Estimate(0.015)),
+    ),
+    (Coupling(("a", "b"), 0.006, 1e-5),),
+)
+
+
+def recorded(rng, delay, gain=1.0):
+    """Two axes in closed loop; the position of b is measured late."""
+    loop = ClosedLoop(MODEL, (AxisLoop(*GAINS), AxisLoop(*GAINS)))
+    time = np.arange(ROWS * FINE) * STEP / FINE
+    experiments = []
+    for number in range(4):
+        fine = np.zeros((time.size, 2))
+        for axis in range(2):
+            for k in range(1, 26, 2):
+                f = k / (ROWS * STEP)
+                fine[:, axis] += (
+                    0.02 / (1 + f / 4) * np.sin(2 * np.pi * f * time + rng.uniform(0, 6))
+                )
+        fine = np.tile(fine, (PERIODS + 2, 1))
+        position, torque = loop.simulate(fine, STEP / FINE)
+        torque[1:] = (torque[1:] + torque[:-1]) / 2.0
+        late = np.column_stack(
+            [position[:, 0], np.roll(position[:, 1], round(delay * FINE / STEP))]
+        )
+        rows = slice(2 * ROWS * FINE, None, FINE)
+        tau = torque[rows] + 0.004 * rng.normal(size=torque[rows].shape)
+        counts = 2**20 / (2 * np.pi)
+        experiments.append(
+            Experiment(
+                f"run {number} <b>", "multisine", ("a", "b"), (), ROWS * STEP,
+                STEP * np.arange(len(tau)), np.round(late[rows] * counts) / counts, gain * tau,
+                position_reference=fine[rows],
+            )
+        )  # fmt: skip
+    axes = tuple(
+        AxisInfo(axis.name, "rotary", len(axis.masses), controller=Controller(*GAINS, 6.0))
+        for axis in MODEL.axes
+    )
+    return Recording(STEP, axes, tuple(experiments), HOSTILE.replace("\u2028", ""))
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory):
+    """A folder with a recording, a model, and a criticism that names a delay."""
+    folder = SessionFolder.create(tmp_path_factory.mktemp("session") / "s")
+    recording = recorded(np.random.default_rng(5), 12 * STEP / FINE)
+    save(recording, folder.recording)
+    found = criticise(recording, MODEL, MODEL)
+    write_model(found.criticism.model, folder.model)
+    write_yaml(folder.criticism, found.criticism.as_dict())
+    save_pictures(pictures_of(found.found), folder.views)
+    folder.note("session", machine=HOSTILE, command="measure", options={"plan": "fast"})
+    folder.note("warning", text=HOSTILE)
+    return folder, found
+
+
+def test_a_criticism_is_read_as_it_was_written(session):
+    folder, found = session
+    again = read_criticism(folder.criticism, found.criticism.model)
+    assert again.as_dict() == found.criticism.as_dict()
+    assert again.causes[0].effect == "measurement_delay"
+
+
+def test_a_criticism_with_a_wrong_key_is_refused_with_its_line(session, tmp_path):
+    folder, found = session
+    data = yaml.safe_load(folder.criticism.read_text())
+    data["causes"][0]["gain"] = "much"
+    path = tmp_path / "criticism.yaml"
+    write_yaml(path, data)
+    with pytest.raises(FileFormatError, match=r"criticism.yaml:\d+: 'causes.0.gain'"):
+        read_criticism(path, found.criticism.model)
+
+
+def test_pictures_survive_their_file_and_speak_of_the_cause(session):
+    folder, found = session
+    seen = load_pictures(folder.views)
+    made = pictures_of(found.found)
+    assert [(p.axis, p.kind, p.sentence) for p in seen] == [
+        (p.axis, p.kind, p.sentence) for p in made
+    ]
+    for one, other in zip(seen, made, strict=True):
+        for a, b in zip(one.series, other.series, strict=True):
+            assert np.array_equal(a.y, b.y, equal_nan=True)
+    by = {(p.axis, p.kind): p for p in seen}
+    # A delay is linear, of the axis' own motion, and leaves nothing between the lines.
+    assert "own motion" in by["b", "follows"].sentence
+    assert "own motion" in by["b", "axes"].sentence
+    assert "answers linearly" in by["b", "lines"].sentence
+    assert "one size" in by["b", "amplitude"].sentence
+    assert "no drift" in by["b", "session"].sentence
+    before, after = by["b", "session"].series
+    assert np.median(after.y) < 0.5 * np.median(before.y)
+
+
+def test_a_report_says_cause_numbers_and_gain_in_words(session, tmp_path):
+    folder, found = session
+    html = report(folder.path, tmp_path / "r.html").read_text(encoding="utf-8")
+    text = re.sub(r"<[^>]+>", " ", html.split('<script type="application/json"')[0])
+    assert "a position that is measured late of b (motor)" in text
+    held = found.criticism.held_out
+    assert f"{100 * held.error_before['b'].torque:.2g} %" in text
+    assert "What was rejected, and why" in text
+    assert "no controller was designed" in text  # this session has not come so far
+    assert "What is missing" in text
+
+
+def test_a_recordings_own_words_are_inert_in_its_report(session, tmp_path):
+    folder, _ = session
+    html = report(folder.path, tmp_path / "r.html").read_text(encoding="utf-8")
+    found = elements(html)
+    assert [kind for kind, _ in found.scripts].count("") == 2
+    assert not [1 for tag, _ in found.tags if tag == "img"]
+    assert "alert(1)" in html  # it is there, as text
+
+
+@pytest.mark.parametrize(
+    "left", [("recording.h5",), ("recording.h5", "model.yaml"), ("events.jsonl",)]
+)
+def test_part_of_a_folder_has_a_report_that_says_what_is_missing(session, tmp_path, left):
+    folder, _ = session
+    part = tmp_path / "part"
+    part.mkdir()
+    for name in left:
+        shutil.copy(folder.path / name, part / name)
+    html = report(part).read_text(encoding="utf-8")
+    assert "What is missing" in html
+    lacking = "not identified" if "model.yaml" not in left else "not criticised"
+    assert lacking in html
+
+
+def test_a_damaged_file_is_named_and_the_rest_is_shown(session, tmp_path):
+    folder, _ = session
+    part = tmp_path / "part"
+    shutil.copytree(folder.path, part)
+    (part / "criticism.yaml").write_text("format: [\n")
+    (part / "criticism-views.h5").write_bytes(b"nothing")
+    material = material_of(SessionFolder(part))
+    assert material.model is not None
+    assert material.criticism is None
+    assert any("criticism.yaml can not be read" in sentence for sentence in material.missing)
+    assert report(part).is_file()
+
+
+def test_a_stopped_session_says_how_it_ended(session, tmp_path):
+    folder, _ = session
+    part = tmp_path / "part"
+    part.mkdir()
+    shutil.copy(folder.recording, part)
+    SessionFolder(part).note("ended", error="UserStopError", text="stopped by the user")
+    html = report(part).read_text(encoding="utf-8")
+    assert "did not come to its end" in html
+    assert "The machine was measured; it was not identified." in html
+
+
+@pytest.mark.parametrize("kind", ["none", "empty", "file"])
+def test_what_is_no_session_is_refused_in_one_sentence(tmp_path, capsys, kind):
+    path = tmp_path / "x"
+    if kind == "empty":
+        path.mkdir()
+    elif kind == "file":
+        path.write_text("text")
+    with pytest.raises(SystemExit) as ended:
+        main(["report", str(path)])
+    assert ended.value.code == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert {"none": "does not exist", "empty": "no session folder", "file": "is a file"}[
+        kind
+    ] in said
+
+
+def test_json_says_where_the_report_is(session, tmp_path, capsys):
+    folder, _ = session
+    out = tmp_path / "r.html"
+    with pytest.raises(SystemExit) as ended:
+        main(["report", str(folder.path), "--out", str(out), "--json"])
+    assert ended.value.code == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said == {"report": str(out), "bytes": out.stat().st_size}
+    assert 1e6 < said["bytes"] < 8e6
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium on this computer")
+def test_a_browser_draws_all_of_it_asks_for_nothing_and_complains_of_nothing(session, tmp_path):
+    browsers = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    folder, _ = session
+    path = report(folder.path, tmp_path / "r.html")
+    complaints, asked, dialogs = [], [], []
+    with browsers.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        try:
+            tab = browser.new_page(viewport={"width": 1200, "height": 900})
+            tab.on("console", lambda message: complaints.append(message.text))
+            tab.on("pageerror", lambda error: complaints.append(str(error)))
+            tab.on("request", lambda request: asked.append(request.url))
+            tab.on("dialog", lambda dialog: (dialogs.append(dialog.message), dialog.dismiss()))
+            tab.goto(path.as_uri())
+            tab.evaluate("window.dispatchEvent(new Event('beforeprint'))")
+            wanted = tab.evaluate("document.querySelectorAll('[data-figure]').length")
+            tab.wait_for_function(
+                "n => document.querySelectorAll('[data-figure] svg.main-svg').length >= n",
+                arg=wanted,
+            )
+            wide = tab.evaluate("document.documentElement.scrollWidth")
+            printed = tab.pdf()
+        finally:
+            browser.close()
+    assert wanted > 20
+    assert complaints == []
+    assert dialogs == []
+    assert asked == [path.as_uri()]
+    assert wide <= 1200
+    assert printed.startswith(b"%PDF")
+
+
+def test_numbers_of_unknown_error_are_said_to_be_unknown(session, tmp_path):
+    folder, found = session
+    part = tmp_path / "part"
+    shutil.copytree(folder.path, part)
+    axes = tuple(
+        replace(a, masses=tuple(Estimate(m.value) for m in a.masses))
+        for a in found.criticism.model.axes
+    )
+    write_model(replace(found.criticism.model, axes=axes), Path(part / "model.yaml"))
+    assert "± not known" in report(part).read_text(encoding="utf-8")
