@@ -119,6 +119,29 @@ at the start); None ends the stream.  Columns of floating axes are not used.  A 
 ``Targets`` in a motion that streams torque offsets; a plain array has offsets of 0."""
 
 
+@dataclass(frozen=True)
+class Alarm:
+    """Why a motion has to end at once."""
+
+    sentence: str
+    """For a person: axis, value, unit, limit."""
+    axis: str
+    """Name of the axis that shows it most."""
+    power_off: frozenset[str]
+    """Axes whose own loops make it: a quick stop would leave them closed, so their power is cut."""
+
+
+class MotionWatch(Protocol):
+    """Looks at all axes in every cycle in which one is enabled, whatever moves them."""
+
+    @property
+    def trusts_loops(self) -> bool:
+        """Whether a quick stop may be left to the drives' loops; else a safety stop cuts all power."""
+
+    def take(self, position: Sequence[float], torque: Sequence[float]) -> Alarm | None:
+        """Take the sample of one SYNC, M values each, SI; return why the motion has to end, or None."""
+
+
 class Drive(Protocol):
     """One axis' drive."""
 

@@ -16,12 +16,14 @@
     │   └── SdoTimeoutError       the drive did not answer
     ├── StoppedError              the machine was stopped while it moved
     │   ├── SafetyStopError       by a limit or a fault
+    │   │   └── OscillationError  by the watch for loops that swing or run by themselves
     │   └── UserStopError         by the user
+    ├── NotVerifiedError          new parameters did not stand the test on the machine
     ├── WriteBackError            writing failed and everything was restored
     └── WriteBackMixedError       writing failed and could not be restored
 """
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 
 
@@ -105,15 +107,26 @@ class SafetyStopError(StoppedError):
         axis: str | None = None,
         cycle: int | None = None,
         runaway: bool = False,
+        power_off: Collection[str] = (),
     ) -> None:
         self.axis, self.cycle = axis, cycle
         self.runaway = runaway
         """The axis moves by itself: a quick stop may make it worse, its power is cut at once."""
+        self.power_off = frozenset(power_off) | ({axis} if runaway and axis else frozenset())
+        """All axes of which that is so."""
         super().__init__(message)
+
+
+class OscillationError(SafetyStopError):
+    """An axis swings, runs or pushes by itself, as with gains that do not fit; its power was cut."""
 
 
 class UserStopError(StoppedError):
     """The user asked to stop; all axes were stopped."""
+
+
+class NotVerifiedError(DrivesError):
+    """New parameters did not stand the test on the machine; what is written is taken back."""
 
 
 class WriteBackError(DrivesError):

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import can
 
+from drives.api import MotionWatch
 from drives.bus import CyclicLoad, check_cycle, open_bus, shortest_cycle
 from drives.canopen_drive import fail_safe, setup
 from drives.canopen_drive.drive import CanopenDrive
@@ -121,7 +122,11 @@ class CanopenGroup:
 
     @contextmanager
     def motion(
-        self, cycle_time: float, free: Collection[str] = (), torque_offset: bool = False
+        self,
+        cycle_time: float,
+        free: Collection[str] = (),
+        torque_offset: bool = False,
+        watch: MotionWatch | None = None,
     ) -> Iterator[CanopenMotion]:
         """Enable all axes: those in ``free`` float without torque, the others hold position.
 
@@ -137,6 +142,8 @@ class CanopenGroup:
         torque_offset
             Whether torque offsets are streamed with the positions (``drives.api.Targets``), to the
             axes that :attr:`torque_offsets` shows; those of the others must be 0.
+        watch
+            Looks at every cycle from the first axis' enabling on, besides the limits.
 
         Raises
         ------
@@ -175,7 +182,14 @@ class CanopenGroup:
             stack.callback(sync.close)
             floating = frozenset(free)
             motion = CanopenMotion(
-                self.line, self._drives, cycle_time, floating, self._stop_requested, offsets, sync
+                self.line,
+                self._drives,
+                cycle_time,
+                floating,
+                self._stop_requested,
+                offsets,
+                sync,
+                watch,
             )
             motion.perhaps_enabled = unsure
             motion.real_time = stack.enter_context(undisturbed(self.line.clock))

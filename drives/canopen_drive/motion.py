@@ -12,7 +12,7 @@ import can
 import numpy as np
 
 from drives import objects
-from drives.api import Capture, FloatArray, Source, Targets, joined
+from drives.api import Capture, FloatArray, MotionWatch, Source, Targets, joined
 from drives.canopen_drive.channel import INPUT, OUTPUT, Channel, channel_of
 from drives.canopen_drive.drive import CanopenDrive
 from drives.canopen_drive.interrupts import uninterrupted
@@ -26,6 +26,7 @@ from drives.cia402 import ENABLED_VALUE, STEP_TOWARDS_ENABLED, Controlword, Mode
 from drives.errors import (
     DriveFaultError,
     DrivesError,
+    OscillationError,
     SafetyStopError,
     SdoError,
     StoppedError,
@@ -63,8 +64,10 @@ class CanopenMotion:
         stop_requested: Callable[[], bool],
         offsets: frozenset[str] = frozenset(),
         sync: Sync | None = None,
+        watch: MotionWatch | None = None,
     ) -> None:
         self._line, self._cycle_time, self._stop_requested = line, cycle_time, stop_requested
+        self._watch = watch
         self._channels = [
             channel_of(d, cycle_time, d.axis in free, d.axis in offsets) for d in drives
         ]
@@ -206,6 +209,8 @@ class CanopenMotion:
             self._cycle([self._word(c, _next_word(c.state)) for c in self._channels])
             self._check_user()
             self._check_strangers()
+            if any(c.state is PowerState.OPERATION_ENABLED for c in self._channels):
+                self._look()
             for channel in self._channels:
                 self._check_enabling(channel)
             if all(c.state is PowerState.OPERATION_ENABLED for c in self._channels):
@@ -313,7 +318,7 @@ class CanopenMotion:
     def stop(self, cause: BaseException | None = None) -> None:
         """Quick stop all axes at once, then disable them; never raises for what a drive does.
 
-        The axis that a ``SafetyStopError`` calls a runaway is not ramped down: its power is cut.
+        Axes that a ``SafetyStopError`` names in ``power_off`` are not ramped down: their power is cut.
         """
         if self._stopped:
             return
@@ -321,13 +326,21 @@ class CanopenMotion:
             self._stopped = True
             for channel in self._channels:
                 channel.hold = None  # from now on the target is where the axis is
-            runaway = cause.axis if isinstance(cause, SafetyStopError) and cause.runaway else None
-            self._or_last_resort(lambda: self._quick_stop(runaway))
+            cut = self._without_quick_stop(cause)
+            self._or_last_resort(lambda: self._quick_stop(cut))
             self._make_sure_off()
             if cause is not None:
                 for sentence in self.perhaps_enabled.values():
                     cause.add_note(sentence)
                 self._explain(cause)
+
+    def _without_quick_stop(self, cause: BaseException | None) -> frozenset[str]:
+        """Return the axes whose power is cut at once: a quick stop needs loops that can be trusted."""
+        if not isinstance(cause, SafetyStopError):
+            return frozenset()
+        if self._watch is not None and not self._watch.trusts_loops:
+            return frozenset(c.drive.axis for c in self._channels)
+        return cause.power_off
 
     def _make_sure_off(self) -> None:
         """Believe only a fresh statusword; else switch off by SDO, and say what stays unknown.
@@ -362,14 +375,14 @@ class CanopenMotion:
         except Exception:  # whatever it was, the axes must not stay enabled
             self._last_resort()
 
-    def _quick_stop(self, runaway: str | None) -> None:
-        """Command a quick stop until every axis stands or is off; cut the power of a runaway."""
+    def _quick_stop(self, cut: frozenset[str]) -> None:
+        """Command a quick stop until every axis stands or is off; cut the power of some at once."""
         channels = self._channels
         for channel in channels:
             if channel.missing:  # perhaps it does not take part in SYNC or PDO any more
                 channel.drive.order_quick_stop()
         words = [
-            Controlword.DISABLE_VOLTAGE if c.drive.axis == runaway else Controlword.QUICK_STOP
+            Controlword.DISABLE_VOLTAGE if c.drive.axis in cut else Controlword.QUICK_STOP
             for c in channels
         ]
         fast = [
@@ -574,6 +587,7 @@ class CanopenMotion:
         self._check_user()
         self._check_lateness()
         self._check_strangers()
+        self._look()
         now = self._line.clock.now()
         for channel, target in zip(self._channels, targets.tolist(), strict=True):
             if not channel.is_fine(target, now):
@@ -583,6 +597,24 @@ class CanopenMotion:
                     cycle=self._count - 1,
                     runaway=channel.is_stuck(target),
                 )
+
+    def _look(self) -> None:
+        """Have the watch look at this cycle; raise OscillationError if it says that this has to end."""
+        if self._watch is None:
+            return
+        scales = [c.drive.scaling for c in self._channels]
+        inputs = [INPUT.unpack(c.last) for c in self._channels]
+        alarm = self._watch.take(
+            [one[1] * scale.position for one, scale in zip(inputs, scales, strict=True)],
+            [one[2] * scale.torque for one, scale in zip(inputs, scales, strict=True)],
+        )
+        if alarm is not None:
+            raise OscillationError(
+                alarm.sentence,
+                axis=alarm.axis,
+                cycle=self._count - 1,
+                power_off=alarm.power_off,
+            )
 
 
 def _is_off(statusword: int) -> bool:

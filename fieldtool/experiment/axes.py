@@ -7,7 +7,7 @@ from typing import Protocol
 
 import numpy as np
 
-from drives.api import AxisLimits, Capture, FloatArray, Motion
+from drives.api import AxisLimits, Capture, FloatArray, Motion, MotionWatch
 from fieldtool.errors import FieldtoolError
 from fieldtool.experiment.stepped.plan import smooth_move
 from fieldtool.records.recording import Experiment
@@ -25,7 +25,11 @@ class Mover(Protocol):
     """Gives enabled axes: ``CanopenGroup`` does."""
 
     def motion(
-        self, cycle_time: float, free: tuple[str, ...] = (), torque_offset: bool = False
+        self,
+        cycle_time: float,
+        free: tuple[str, ...] = (),
+        torque_offset: bool = False,
+        watch: MotionWatch | None = None,
     ) -> AbstractContextManager[Motion]:
         """Enable all axes; those in ``free`` float; torque offsets can be streamed if asked for."""
 

@@ -1,0 +1,1 @@
+"""Test new loops on the machine: watch first, then hold, then the smallest move, then the rest."""

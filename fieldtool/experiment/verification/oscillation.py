@@ -1,0 +1,262 @@
+"""A watch for loops that swing, run away or push by themselves: from position and torque alone.
+
+It knows no model, no target and no controller.  It sees the positions and torques that are measured in
+each cycle, and what is *allowed* for the time being.  Each of these ends the motion:
+
+corridor
+    A position leaves its corridor, or a torque goes farther from its value at rest than it may.  A loop
+    of the wrong sign does so in some cycles.
+swings
+    Torque or position turn back again and again by more than a level.  A turn counts as soon as the
+    signal has come back by the level.
+growth
+    Where swings are to be expected (what rings after a move dies out) they count if they grow, or are
+    far above the level.
+
+An oscillation of frequency f is found some ``(turns + 1) / (2 f)`` after its swing is larger than the
+level; one that is slower than ``half_period`` leaves the corridor first.  Valid while the level is
+above noise: the levels are shares of limits, and grow with the encoder's counts.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from drives.api import Alarm, AxisLimits, FloatArray
+from fieldtool.experiment.verification.swings import Swings
+
+HOLD_LEVEL, HOLD_TURNS = 0.08, 2
+"""At rest: share of the torque limit, peak to peak, by which the torque may swing, and turns."""
+MOVE_LEVEL, MOVE_TURNS = 0.15, 3
+"""While something is moved: the same."""
+SWING_OF_ERROR, SWING_COUNTS = 0.02, 8.0
+"""Share of the following error limit, and counts of the encoder besides, by which a position may swing,
+peak to peak; at rest half of it."""
+GROWS = 1.2
+"""A swing grows that is larger by this than one before it, in the same direction, of the same series."""
+FAR_ABOVE = 5.0
+"""Times the level: swings of this size count whether they grow or not."""
+LONGEST_HALF = 0.25
+"""Seconds from one turn to the next, at most."""
+TORQUE_UNITS = {"rad": "N m", "m": "N"}
+REST_TIME = 0.05
+"""Time constant with which the torque at rest is found, s."""
+
+
+@dataclass(frozen=True, eq=False)
+class Allowed:
+    """What all axes may do for the time being; shapes (M,), SI."""
+
+    low: FloatArray
+    high: FloatArray
+    """Ends of the corridors of positions."""
+    torque: FloatArray
+    """Largest distance of the torques from those at rest."""
+    torque_swing: FloatArray
+    """Peak to peak."""
+    position_swing: FloatArray
+    """Peak to peak."""
+    turns: int
+    growing: bool
+    """Whether swings count only if they grow, or are far above the level."""
+    resting: bool
+    """Whether the torque of the time being is that at rest."""
+    half_period: float = LONGEST_HALF
+    """Seconds from one turn to the next, at most, to count as one oscillation."""
+
+
+class OscillationWatch:
+    """Watches all axes of one motion; a ``drives.api.MotionWatch``.
+
+    Until it is told otherwise, axes have to stand still where they are first seen.
+
+    Parameters
+    ----------
+    names, limits
+        Of the axes.
+    counts
+        One count of each encoder, shape (M,), rad or m.
+    still
+        How far an axis may go that is to stand still, shape (M,), rad or m.
+    step
+        Cycle time, s.
+    trusts_loops
+        Whether the drives' loops are known to be good: then a stop may leave a quick stop to them.
+    louder
+        Times the usual level by which torques may swing at rest, shape (M,): 1 but for axes that were
+        heard to be louder with loops that are known to be good.
+    units
+        Of positions, one an axis, for messages.
+    """
+
+    def __init__(
+        self,
+        names: Sequence[str],
+        limits: Sequence[AxisLimits],
+        counts: FloatArray,
+        still: FloatArray,
+        step: float,
+        *,
+        trusts_loops: bool,
+        louder: FloatArray | None = None,
+        units: Sequence[str] = (),
+    ) -> None:
+        self._names, self._step, self._still = tuple(names), step, still
+        self._units = [(unit, TORQUE_UNITS.get(unit, "")) for unit in units or [""] * len(names)]
+        self._torque_limits = np.array([one.torque for one in limits])
+        errors = np.array([one.following_error for one in limits])
+        self._position_swing = SWING_OF_ERROR * errors + SWING_COUNTS * counts
+        self._louder = np.ones(len(self._names)) if louder is None else louder
+        self._trusts_loops = trusts_loops
+        self._torques = [Swings() for _ in self._names]
+        self._positions = [Swings() for _ in self._names]
+        self._rest: list[float] = []
+        self._allowed: Allowed | None = None
+        self.alarm: Alarm | None = None
+        """What ended the motion."""
+
+    @property
+    def trusts_loops(self) -> bool:
+        """Whether a quick stop may be left to the drives' loops."""
+        return self._trusts_loops
+
+    def begin(self) -> None:
+        """Another motion begins: its axes stand still where they are first seen."""
+        self._allowed, self._rest = None, []
+
+    def hold(self, at: FloatArray) -> None:
+        """Allow no more than standing still at positions, shape (M,)."""
+        self._allow(
+            Allowed(
+                at - self._still,
+                at + self._still,
+                self._torque_limits,
+                self._louder * HOLD_LEVEL * self._torque_limits,
+                self._position_swing / 2,
+                HOLD_TURNS,
+                growing=False,
+                resting=True,
+            )
+        )
+
+    def move(
+        self,
+        low: FloatArray,
+        high: FloatArray,
+        torque: FloatArray,
+        half_period: float = LONGEST_HALF,
+        *,
+        gentle: bool = False,
+    ) -> None:
+        """Allow motion inside corridors (M,), with torques up to (M,) about those at rest.
+
+        A gentle one makes no swings of its own worth the name: they count as at rest.
+        """
+        share = HOLD_LEVEL if gentle else MOVE_LEVEL
+        level = np.maximum(self._louder * HOLD_LEVEL, share) * self._torque_limits
+        self._allow(
+            Allowed(
+                low,
+                high,
+                torque,
+                level,
+                self._position_swing,
+                HOLD_TURNS if gentle else MOVE_TURNS,
+                growing=not gentle,
+                resting=False,
+                half_period=min(half_period, LONGEST_HALF),
+            )
+        )
+
+    def excite(self, low: FloatArray, high: FloatArray, torque: FloatArray) -> None:
+        """Allow motion that swings by itself inside corridors (M,), with torques up to (M,)."""
+        self._allow(
+            Allowed(
+                low,
+                high,
+                torque,
+                1.2 * 2 * torque,
+                np.full(torque.size, np.inf),
+                MOVE_TURNS,
+                growing=True,
+                resting=False,
+            )
+        )
+
+    def _allow(self, allowed: Allowed) -> None:
+        self._allowed = allowed
+        for torque, level in zip(self._torques, allowed.torque_swing.tolist(), strict=True):
+            torque.restart(level)
+        for position, level in zip(self._positions, allowed.position_swing.tolist(), strict=True):
+            position.restart(level)
+
+    def take(self, position: Sequence[float], torque: Sequence[float]) -> Alarm | None:
+        """Take one cycle; see ``drives.api.MotionWatch``."""
+        if self._allowed is None:
+            self.hold(np.array(position))
+        allowed = self._allowed
+        if allowed is None:
+            raise AssertionError("something is always allowed")
+        found = [
+            (k, text)
+            for k in range(len(self._names))
+            if (text := self._judge(k, position[k], torque[k], allowed))
+        ]
+        self._follow_rest(torque, allowed)
+        if not found:
+            return None
+        k, text = found[0]
+        self.alarm = Alarm(
+            f"{self._names[k]}: {text}; its power was cut and all axes were stopped.",
+            self._names[k],
+            frozenset(self._names[j] for j, _ in found),
+        )
+        return self.alarm
+
+    def _follow_rest(self, torque: Sequence[float], allowed: Allowed) -> None:
+        if not self._rest:
+            self._rest = list(torque)
+        elif allowed.resting:
+            share = min(1.0, self._step / REST_TIME)
+            self._rest = [r + share * (t - r) for r, t in zip(self._rest, torque, strict=True)]
+
+    def _judge(self, k: int, position: float, torque: float, allowed: Allowed) -> str:
+        """Return what is wrong with an axis, in words; empty where nothing is."""
+        turned = self._torques[k].take(torque)
+        swung = self._positions[k].take(position)
+        unit, torque_unit = self._units[k]
+        if not allowed.low[k] <= position <= allowed.high[k]:
+            return (
+                f"is at {position:.5g} {unit}, outside of {allowed.low[k]:.5g} to "
+                f"{allowed.high[k]:.5g} {unit} where it has to stay: its loop runs away or swings"
+            )
+        push = torque - (self._rest[k] if self._rest else torque)
+        if abs(push) > allowed.torque[k]:
+            return (
+                f"its torque went {abs(push):.3g} {torque_unit} from that at rest, above the "
+                f"{allowed.torque[k]:.3g} {torque_unit} allowed here: its loop swings or pushes"
+            )
+        for swings, seen, what, of in (
+            (self._torques[k], turned, "torque", torque_unit),
+            (self._positions[k], swung, "position", unit),
+        ):
+            if seen and self._oscillates(swings, allowed):
+                frequency = swings.frequency(allowed.turns) / self._step
+                return (
+                    f"oscillates at about {frequency:.3g} Hz: its {what} swings by "
+                    f"{swings.sizes[-1]:.3g} {of}, peak to peak, above the level of "
+                    f"{swings.level:.3g} {of}"
+                )
+        return ""
+
+    def _oscillates(self, swings: Swings, allowed: Allowed) -> bool:
+        """Whether the swings, of which one was completed just now, are an oscillation."""
+        if not swings.within(allowed.turns, int(allowed.half_period / self._step) + 1):
+            return False
+        if not allowed.growing:
+            return True
+        if min(swings.sizes[-allowed.turns :]) > FAR_ABOVE * swings.level:
+            return True
+        series = swings.series(int(allowed.half_period / self._step) + 1)
+        return series[-1] > GROWS * min(series[-3::-2])

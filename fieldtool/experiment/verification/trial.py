@@ -1,0 +1,331 @@
+"""The short test of the loops that are in the drives: hold, nudge, move, excite; watched throughout.
+
+Nothing is trusted that has not been seen: the axes first stand still, then each is nudged by a little of
+its move, then each makes its move and comes back, then all are excited a little at the same time.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from drives.api import Capture, FloatArray, Motion, MotionWatch
+from drives.errors import StoppedError
+from fieldtool.experiment.axes import Axes, Keep, Mover, keep_whatever_happens, sample_times
+from fieldtool.experiment.directions import (
+    CHECK_ASTRAY,
+    CHECK_ASTRAY_ERROR,
+    CHECK_COUNTS,
+    CHECK_PUSHED,
+)
+from fieldtool.experiment.multisine.plan import MultisinePlan
+from fieldtool.experiment.multisine.runner import Report, run_multisine
+from fieldtool.experiment.stepped.plan import smooth_move
+from fieldtool.experiment.verification.oscillation import LONGEST_HALF, OscillationWatch
+from fieldtool.records.recording import Experiment
+
+HOLD_TIME = 0.5
+"""Seconds in which all axes stand still before anything else is asked of them."""
+NUDGE_SHARE, NUDGE_TIME, NUDGE_COUNTS = 0.02, 0.5, 20.0
+"""A nudge is this share of the move, or so many counts of the encoder; seconds for each way."""
+NUDGE_TORQUE = 0.3
+"""Share of the torque limit that a nudge may take."""
+BEYOND, BEHIND = 0.5, 0.15
+"""Shares of a move by which it may be overshot, and by which the axis may go the wrong way."""
+SLICE_TIME = 0.02
+"""Seconds that are sent at a time."""
+
+
+@dataclass(frozen=True, eq=False)
+class TrialMove:
+    """One axis' move out, as displacements; it comes back the same way."""
+
+    axis: int
+    reference: FloatArray
+    """From 0 to the distance, shape (n,), rad or m."""
+    rest: int
+    """Cycles that are watched after it, and after the way back."""
+    torque: FloatArray
+    """How far torques may go from those at rest meanwhile, shape (M,)."""
+    half_period: float = LONGEST_HALF
+    """Seconds from turn to turn below which torque and position do not turn by what is commanded."""
+
+    @property
+    def distance(self) -> float:
+        """With its sign."""
+        return float(self.reference[-1])
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """What is done; the same with old and with new loops."""
+
+    cycle_time: float
+    """Seconds."""
+    moves: tuple[TrialMove, ...]
+    excitation: MultisinePlan | None
+    """Small multisine of all axes at once; None: none."""
+    excursion: FloatArray
+    """How far it may take each axis from where it stands, shape (M,)."""
+    torque: FloatArray
+    """How far it may take the torques from those at rest, shape (M,)."""
+
+    @property
+    def duration(self) -> float:
+        """Seconds, all of it."""
+        rows = sum(2 * (move.reference.size + move.rest) for move in self.moves)
+        nudges = len(self.moves) * 3 * NUDGE_TIME
+        excited = self.excitation.duration if self.excitation else 0.0
+        return rows * self.cycle_time + nudges + 2 * HOLD_TIME + excited
+
+
+@dataclass(frozen=True, eq=False)
+class Tried:
+    """What was recorded."""
+
+    experiments: tuple[Experiment, ...]
+    noise: FloatArray
+    """Peak-to-peak torque of each axis while all stood still, shape (M,)."""
+
+    def move(self, axis: str) -> Experiment | None:
+        """Return the move of an axis; None if there was none."""
+        return next((e for e in self.experiments if e.driven == (axis,)), None)
+
+    @property
+    def excitation(self) -> Experiment | None:
+        """The multisine; None if there was none."""
+        return next((e for e in self.experiments if e.kind == "multisine"), None)
+
+
+def still_allowed(axes: Axes) -> FloatArray:
+    """Return how far axes may go that are told to stand still, shape (M,), rad or m."""
+    travel = np.array([one.travel[1] - one.travel[0] for one in axes.limits])
+    errors = np.array([one.following_error for one in axes.limits])
+    still: FloatArray = np.maximum(CHECK_ASTRAY * travel, CHECK_ASTRAY_ERROR * errors)
+    return still + CHECK_COUNTS * axes.counts
+
+
+class WatchedMover:
+    """Gives enabled axes that were seen to stand still first, with a watch that looks at every cycle."""
+
+    def __init__(self, group: Mover, watch: OscillationWatch, rests: list[Capture]) -> None:
+        self._group, self._watch, self._rests = group, watch, rests
+
+    @contextmanager
+    def motion(
+        self,
+        cycle_time: float,
+        free: tuple[str, ...] = (),
+        torque_offset: bool = False,
+        watch: MotionWatch | None = None,
+    ) -> Iterator[Motion]:
+        """Enable all axes, and see them stand still for a while before they are handed on."""
+        if watch is not None:
+            raise ValueError("these axes have a watch already")
+        self._watch.begin()
+        with self._group.motion(cycle_time, free, torque_offset, self._watch) as motion:
+            start = motion.position
+            self._watch.hold(start)
+            still = np.tile(start, (max(2, round(HOLD_TIME / cycle_time)), 1))
+            self._rests.append(motion.stream(_slices(still, cycle_time)))
+            yield motion
+
+
+def run_trial(
+    group: Mover,
+    trial: Trial,
+    axes: Axes,
+    keep: Keep,
+    name: str,
+    *,
+    trusts_loops: bool,
+    louder: FloatArray | None = None,
+    report: Report = lambda _: None,
+) -> Tried:
+    """Do all of a trial where the axes stand; whatever ends it, they are stopped and disabled.
+
+    Parameters
+    ----------
+    group
+        Gives enabled axes.
+    trial
+        Moves and excitation; they have to fit the travel from where the axes stand.
+    axes
+        Names, limits, counts.
+    keep
+        Gets each experiment's raw data once the drives are off, also when it was cut short.
+    name
+        Whose loops are tried, for the experiments' names: ``before``, ``after``.
+    trusts_loops, louder
+        See :class:`OscillationWatch`.
+    report
+        Is told how far the excitation is.
+
+    Raises
+    ------
+    OscillationError
+        If a loop swings, runs away or pushes; its power was cut.
+    StoppedError
+        If a limit was passed, a drive failed or the user stopped.
+    """
+    still = still_allowed(axes)
+    watch = OscillationWatch(
+        axes.names,
+        axes.limits,
+        axes.counts,
+        still,
+        trial.cycle_time,
+        trusts_loops=trusts_loops,
+        louder=louder,
+        units=axes.units,
+    )
+    rests: list[Capture] = []
+    mover = WatchedMover(group, watch, rests)
+    kept: list[Experiment] = []
+    try:
+        with mover.motion(trial.cycle_time) as motion:
+            start = motion.position
+            steps = _Steps(motion, watch, axes, still, start, name, kept)
+            for move in trial.moves:
+                steps.nudge(move)
+            for move in trial.moves:
+                steps.move(move)
+        if trial.excitation is not None:
+            there = replace(axes, centre=start)
+            exciting = _Excited(mover, watch, start, trial, still)
+            run_multisine(exciting, trial.excitation, there, kept.append, report)
+    except BaseException as error:
+        keep_whatever_happens(kept, keep, error)
+        raise
+    for experiment in kept:  # the disk may be slow: not while axes wait for their SYNC
+        keep(experiment)
+    noise = np.max([np.ptp(rest.torque[rest.rows // 2 :], axis=0) for rest in rests], axis=0)
+    return Tried(tuple(kept), noise)
+
+
+class _Steps:
+    """Nudges and moves of one motion."""
+
+    def __init__(
+        self,
+        motion: Motion,
+        watch: OscillationWatch,
+        axes: Axes,
+        still: FloatArray,
+        start: FloatArray,
+        name: str,
+        kept: list[Experiment],
+    ) -> None:
+        self._motion, self._watch, self._axes = motion, watch, axes
+        self._still, self._start, self._name, self._kept = still, start, name, kept
+
+    def nudge(self, move: TrialMove) -> None:
+        """Go a little way and back; the axis has to go there, and no other may move."""
+        axes, k, step = self._axes, move.axis, self._motion.cycle_time
+        size = max(NUDGE_SHARE * abs(move.distance), NUDGE_COUNTS * float(axes.counts[k]))
+        size = float(np.copysign(min(size, abs(move.distance)), move.distance))
+        limits = axes.limits[k]
+        there = smooth_move(size, limits.velocity, limits.acceleration, step, NUDGE_TIME)
+        pause = np.full(max(2, round(NUDGE_TIME / 2 / step)), 1.0)
+        path = np.concatenate([there, size * pause, size - there, 0 * pause])
+        torque = NUDGE_TORQUE * np.array([one.torque for one in axes.limits])
+        self._allow(k, size, np.minimum(torque, move.torque), NUDGE_TIME / 3, gentle=True)
+        self._stream(path, move.axis, f"{self._name}: nudge of {axes.names[k]}", keep=False)
+
+    def move(self, move: TrialMove) -> None:
+        """Go the whole way, rest, come back, rest."""
+        out, rest = move.reference, np.ones(move.rest)
+        path = np.concatenate([out, move.distance * rest, move.distance - out, 0 * rest])
+        self._allow(move.axis, move.distance, move.torque, move.half_period)
+        self._stream(path, move.axis, f"{self._name}: move of {self._axes.names[move.axis]}")
+
+    def _allow(
+        self,
+        k: int,
+        distance: float,
+        torque: FloatArray,
+        half_period: float,
+        *,
+        gentle: bool = False,
+    ) -> None:
+        slack = CHECK_PUSHED * self._still
+        low, high = self._start - slack, self._start + slack
+        slack_k = float(self._still[k])
+        ends = (-BEHIND * distance, (1 + BEYOND) * distance)
+        low[k] = self._start[k] + min(ends) - slack_k
+        high[k] = self._start[k] + max(ends) + slack_k
+        self._watch.move(low, high, torque, half_period, gentle=gentle)
+
+    def _stream(self, path: FloatArray, k: int, name: str, *, keep: bool = True) -> None:
+        targets = np.tile(self._start, (path.size, 1))
+        targets[:, k] += path
+        try:
+            capture = self._motion.stream(_slices(targets, self._motion.cycle_time))
+        except StoppedError as error:
+            if isinstance(error.capture, Capture) and error.capture.rows > 1:
+                self._kept.append(self._experiment(error.capture, k, name, str(error)))
+            raise
+        if keep:
+            self._kept.append(self._experiment(capture, k, name))
+
+    def _experiment(self, capture: Capture, k: int, name: str, note: str = "") -> Experiment:
+        return Experiment(
+            name=name,
+            kind="moves",
+            driven=(self._axes.names[k],),
+            free=(),
+            period=None,
+            time=sample_times(capture.rows, self._motion.cycle_time),
+            position=capture.position,
+            torque=capture.torque,
+            position_reference=capture.position_reference,
+            statusword=capture.statusword,
+            complete=not note and not capture.missing,
+            note=note or ("samples are missing" if capture.missing else ""),
+        )
+
+
+class _Excited:
+    """A mover that allows swings once the axes have stood still."""
+
+    def __init__(
+        self,
+        mover: WatchedMover,
+        watch: OscillationWatch,
+        start: FloatArray,
+        trial: Trial,
+        still: FloatArray,
+    ) -> None:
+        self._mover, self._watch, self._torque = mover, watch, trial.torque
+        self._low, self._high = start - trial.excursion - still, start + trial.excursion + still
+
+    @contextmanager
+    def motion(
+        self,
+        cycle_time: float,
+        free: tuple[str, ...] = (),
+        torque_offset: bool = False,
+        watch: MotionWatch | None = None,
+    ) -> Iterator[Motion]:
+        with self._mover.motion(cycle_time, free, torque_offset, watch) as motion:
+            self._watch.excite(self._low, self._high, self._torque)
+            yield motion
+
+
+def _slices(targets: FloatArray, step: float) -> "_Slices":
+    return _Slices(targets, max(2, round(SLICE_TIME / step)))
+
+
+class _Slices:
+    """Targets in slices; a ``drives.api.Source``."""
+
+    def __init__(self, targets: FloatArray, rows: int) -> None:
+        self._targets, self._rows, self._done = targets, rows, 0
+
+    def __call__(self, _before: Capture | None) -> FloatArray | None:
+        if self._done >= self._targets.shape[0]:
+            return None
+        part = self._targets[self._done : self._done + self._rows]
+        self._done += part.shape[0]
+        return part

@@ -1,0 +1,171 @@
+"""The trial of loops through the bus, and its watch: an oscillation is stopped within 50 ms."""
+
+import struct
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from drives.errors import OscillationError, SafetyStopError, UserStopError
+from drives.sim.faults import Fault, MotorReversed
+from drives.sim.firmware import Parameter
+from fieldtool.experiment.axes import Axes
+from fieldtool.experiment.verification.trial import HOLD_TIME, Trial, TrialMove, run_trial
+
+STEP = 0.001
+TABLE, ARM = 11, 12
+
+
+@dataclass(frozen=True)
+class Gains(Fault):
+    """A loop's gains become so many times larger, in the drive itself."""
+
+    factor: float = 1.0
+    parameters: tuple[Parameter, ...] = (Parameter.VELOCITY_P, Parameter.VELOCITY_I)
+
+    def set(self, machine, *, present):
+        k = machine.node(self.node_id).axis
+        for parameter in self.parameters:
+            factor = self.factor if present else 1 / self.factor
+            machine.axes.set(k, parameter, machine.axes.get(k, parameter) * factor)
+
+
+def move(axis, distance, seconds, torque):
+    u = np.arange(round(seconds / STEP) + 1) * STEP / seconds
+    reference = distance * u**3 * (10 - 15 * u + 6 * u * u)
+    return TrialMove(axis, reference, round(0.5 / STEP), np.array(torque), 0.2)
+
+
+def trial():
+    moves = (move(0, 0.5, 0.5, [3.0, 3.0]), move(1, -0.5, 0.5, [3.0, 3.0]))
+    return Trial(STEP, moves, None, np.zeros(2), np.zeros(2))
+
+
+def axes_of(group):
+    counts = np.array([drive.scaling.position for drive in group.drives])
+    limits = tuple(drive.limits for drive in group.drives)
+    return Axes(group.axes, limits, np.zeros(2), ("rad", "rad"), counts)
+
+
+def try_it(bench, kept, stop=lambda: False, trusts_loops=False):
+    with bench.connected(stop) as group:
+        return run_trial(
+            group, trial(), axes_of(group), kept.append, "after", trusts_loops=trusts_loops
+        )
+
+
+class Observer:
+    """Hears every statusword and torque on the bus, by virtual time: what really happened, and when."""
+
+    def __init__(self, bench):
+        self.rows = []
+        bench.machine.listen(self)
+
+    def __call__(self, time, cob_id, data):
+        if 0x180 < cob_id < 0x200 and len(data) == 8:
+            statusword, _, torque = struct.unpack("<Hih", data)
+            enabled = statusword & 0x6F == 0x27
+            self.rows.append((1e-9 * time, cob_id - 0x180, enabled, 0.004 * torque))
+
+    def off_at(self):
+        """When the last drive lost its power, s."""
+        return max(t for t, _, enabled, _ in self.rows if enabled)
+
+    def swings_from(self, node, after, level, window=0.03):
+        """When the torque first swung by this share of its limit within a short time, after a time."""
+        own = np.array([(t, torque) for t, n, _, torque in self.rows if n == node and t > after])
+        width = max(2, round(window / STEP))
+        for k in range(own.shape[0]):
+            part = own[max(0, k - width) : k + 1, 1]
+            turns = np.count_nonzero(np.diff(np.sign(np.diff(part))))
+            if np.ptp(part) > level * 6.0 and turns >= 2:
+                return own[k, 0]
+        return None
+
+
+def test_good_loops_stand_the_trial_and_everything_is_recorded(bench):
+    kept = []
+    tried = try_it(bench, kept)
+    assert [e.name for e in kept] == ["after: move of table", "after: move of arm"]
+    assert all(e.complete for e in kept)
+    for k, name in enumerate(("table", "arm")):
+        found = tried.move(name)
+        away = found.position[:, k] - found.position[0, k]
+        assert abs(away[np.argmax(np.abs(away))]) == pytest.approx(0.5, rel=0.1)
+        assert abs(away[-1]) < 0.01
+    assert np.all(tried.noise < 0.5)
+    assert bench.powered() == {}
+    assert bench.changed() == {}
+
+
+def disaster(bench, fault, after):
+    """Bring a fault about so many SYNCs after the bus was opened; return error, observer, records."""
+    observer, kept = Observer(bench), []
+    bench.inject(fault, sync=bench.machine.sync_count + after)
+    with pytest.raises(SafetyStopError) as stopped:
+        try_it(bench, kept)
+    assert bench.powered() == {}
+    bench.machine.lift(fault)
+    assert bench.changed() == {}, "and nothing temporary is left in the drives"
+    return stopped.value, observer, kept
+
+
+IN_HOLD, IN_NUDGE, IN_MOVE = 300, 1200, 4300
+SWINGING = {
+    "velocity loop far too hard": (100.0, (Parameter.VELOCITY_P, Parameter.VELOCITY_I)),
+    "position and integral too hard": (20.0, (Parameter.POSITION_P, Parameter.VELOCITY_I)),
+    "integral far too hard": (400.0, (Parameter.VELOCITY_I,)),
+}
+
+
+@pytest.mark.parametrize("after", [1, IN_HOLD, IN_NUDGE, IN_MOVE])
+@pytest.mark.parametrize("how", SWINGING)
+def test_an_oscillation_that_starts_is_stopped_within_50_ms(bench, how, after):
+    """From where the torque swings by a tenth of its limit (a fifth in a move, which takes some of it
+    itself), peak to peak, until no drive has power."""
+    factor, parameters = SWINGING[how]
+    error, observer, kept = disaster(bench, Gains(TABLE, factor, parameters), after)
+    assert isinstance(error, OscillationError), error
+    assert error.axis == "table"
+    level = 0.2 if after == IN_MOVE else 0.1
+    began = observer.swings_from(TABLE, 0.8 + after * STEP * 0.9 if after > 1 else 0.0, level)
+    assert observer.off_at() - (began or observer.off_at()) <= 0.05, str(error)
+    assert all(e.complete or e.note for e in kept)
+
+
+@pytest.mark.parametrize("after", [1, IN_HOLD, IN_NUDGE, IN_MOVE])
+def test_a_loop_of_the_wrong_sign_is_stopped_while_it_has_hardly_moved(bench, after):
+    error, observer, _ = disaster(bench, MotorReversed(ARM), after)
+    assert isinstance(error, OscillationError), error
+    assert error.axis == "arm"
+    torques = [abs(torque) for _, node, _, torque in observer.rows if node == ARM]
+    assert max(torques) < 4.0, "it was stopped below its limit of 6 N m"
+
+
+def test_ctrl_c_ends_a_trial_with_all_drives_off(bench):
+    asked = 0
+
+    def stop():
+        nonlocal asked
+        asked += 1
+        return asked > 1500
+
+    with pytest.raises(UserStopError):
+        try_it(bench, [], stop)
+    assert bench.powered() == {}
+    assert bench.changed() == {}
+
+
+def test_the_trial_holds_before_it_moves(bench):
+    """Nothing is commanded before all axes have stood still."""
+    bench.listen()
+    try_it(bench, [])
+    targets = {}
+    for frame in bench.heard():
+        if frame.cob_id in (0x200 + TABLE, 0x200 + ARM):
+            word, target, _ = struct.unpack("<Hih", frame.data)
+            if word == 0x0F:
+                targets.setdefault(frame.cob_id, []).append(target)
+    for sent in targets.values():
+        assert len(set(sent[: round(HOLD_TIME / STEP)])) == 1
+        assert len(set(sent)) > 100
