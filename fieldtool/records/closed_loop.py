@@ -12,6 +12,7 @@ modes and loop bandwidths stay below some 100 Hz.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,11 +48,11 @@ class Biquad:
         w = 2 * np.pi * frequency
         return cls((0.0, 0.0, w * w), (2 * damping * w, w * w))
 
-    def response(self, s: ComplexArray) -> ComplexArray:
+    def response(self, s: NDArray[np.complexfloating[Any, Any]]) -> ComplexArray:
         """Return the value at complex frequencies s, rad/s."""
         n2, n1, n0 = self.numerator
         d1, d0 = self.denominator
-        return (n2 * s * s + n1 * s + n0) / (s * s + d1 * s + d0)
+        return np.asarray((n2 * s * s + n1 * s + n0) / (s * s + d1 * s + d0))
 
 
 @dataclass(frozen=True)

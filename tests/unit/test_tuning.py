@@ -7,13 +7,8 @@ import numpy as np
 import pytest
 from scipy.linalg import eigh
 
-from fieldtool.design.tuning import (
-    DesignError,
-    as_parameters,
-    design,
-    lowest_antiresonance,
-    sensitivity_peak,
-)
+from fieldtool.design.rule import DesignError, lowest_antiresonance, sensitivity_peak
+from fieldtool.design.tuning import as_parameters, design
 from fieldtool.records.closed_loop import AxisLoop, ClosedLoop, loop_from_parameters
 from fieldtool.records.model import AxisModel, Coupling, Estimate, MachineModel
 
@@ -147,7 +142,7 @@ def test_the_bound_holds_where_it_matters(
         return max(1 / nyquist_distance(model, loops, k) for k in range(len(loops)))
 
     assert worst() <= 2.0 * 1.01
-    monkeypatch.setattr("fieldtool.design.tuning.SENSITIVITY_BOUND", 100.0)
+    monkeypatch.setattr("fieldtool.design.rule.SENSITIVITY_BOUND", 100.0)
     assert worst() > 2.1
 
 

@@ -1,0 +1,192 @@
+"""The elastic machine with its linear effects, and its response to motor torques and load forces."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import eigh
+
+from fieldtool.records.model import FloatArray, MachineModel
+
+ComplexArray = NDArray[np.complexfloating[Any, Any]]
+RIGID = 1e-9
+"""Of the largest eigenvalue: below it a mode is rigid motion."""
+
+
+@dataclass(frozen=True, eq=False)
+class Machine:
+    """Matrices of M axes with n degrees of freedom, the model's linear effects among them."""
+
+    names: tuple[str, ...]
+    mass: FloatArray
+    """(n, n)."""
+    damping: FloatArray
+    stiffness: FloatArray
+    loss: FloatArray
+    """(n, n): what structural damping adds to the stiffness as imaginary part."""
+    motors: NDArray[np.intp]
+    """(M,) degree of freedom of each motor."""
+    loads: NDArray[np.intp]
+    """(M,) of each chain's last mass."""
+    scale: FloatArray
+    """(M,): torque of the motor over that which the drive reports."""
+    lag: FloatArray
+    """(M,) s: first-order lag from the reported torque to that of the motor."""
+    delay: FloatArray
+    """(M,) s: by which a position is measured later than torque."""
+
+    @property
+    def modes(self) -> FloatArray:
+        """Undamped elastic modes of the free machine, rad/s, rising; empty where it is rigid."""
+        values = eigh(self.stiffness, self.mass, eigvals_only=True)
+        return np.sqrt(values[values > RIGID * max(float(values[-1]), 1e-300)])
+
+    @property
+    def held_modes(self) -> FloatArray:
+        """Modes with all motors held, rad/s, rising: what swings when the loops are stiff."""
+        free = np.setdiff1d(np.arange(self.mass.shape[0]), self.motors)
+        if free.size == 0:
+            return np.zeros(0)
+        inner = np.ix_(free, free)
+        values = eigh(self.stiffness[inner], self.mass[inner], eigvals_only=True)
+        return np.sqrt(values[values > 0])
+
+
+@dataclass(frozen=True, eq=False)
+class Response:
+    """Positions per torque and force at F frequencies, all loops open.
+
+    The motor's lag and scale are in the columns of torques, so that torques are those that drives
+    report.
+    """
+
+    omega: FloatArray
+    """(F,) rad/s, above 0."""
+    motors: ComplexArray
+    """(F, M, M): motors per motor torque."""
+    loads: ComplexArray
+    """(F, M, M): last masses per motor torque."""
+
+
+def machine_of(model: MachineModel) -> Machine:
+    """Return a model's matrices, with those of its effects that are linear.
+
+    ``extra_mode, coupling_spring, coupling_inertia, stiffness_change, structural_damping,
+    asymmetric_friction`` (its viscous part), ``torque_scale, torque_lag, measurement_delay`` are in;
+    the others have no linear part (:mod:`fieldtool.design.nonlinear` says what they do).
+    """
+    m = len(model.axes)
+    parts = _Parts(model)
+    for effect in model.effects:
+        parts.add(effect)
+    return Machine(
+        model.names,
+        parts.mass,
+        parts.damping,
+        parts.stiffness,
+        parts.loss,
+        model.first_masses,
+        model.last_masses,
+        parts.of_axis("torque_scale", "scale", 1.0, m),
+        np.maximum(parts.of_axis("torque_lag", "time", 0.0, m), 0.0),
+        np.maximum(parts.of_axis("measurement_delay", "delay", 0.0, m), 0.0),
+    )
+
+
+def respond(machine: Machine, omega: FloatArray) -> Response:
+    """Return the open machine's response at frequencies ``omega``, shape (F,), rad/s, above 0."""
+    n, m = machine.mass.shape[0], machine.motors.size
+    s = 1j * omega[:, None, None]
+    dynamic = machine.stiffness + 1j * machine.loss + s * machine.damping + s * s * machine.mass
+    torques = np.zeros((n, m))
+    torques[machine.motors, np.arange(m)] = 1.0
+    q = np.linalg.solve(dynamic, np.broadcast_to(torques, (omega.size, n, m)))
+    q = q * (machine.scale / (1 + s * machine.lag))
+    return Response(omega, q[:, machine.motors], q[:, machine.loads])
+
+
+def number(effect: Mapping[str, Any], name: str, otherwise: float = 0.0) -> float:
+    """Return a parameter of an effect as ``model.yaml`` has it: a number, or one with its error."""
+    given = (effect.get("parameters") or {}).get(name, otherwise)
+    return float(given["value"] if isinstance(given, Mapping) else given)
+
+
+def spring_of(model: MachineModel, effect: Mapping[str, Any]) -> tuple[int, int]:
+    """Return axis and number of the spring that an effect is in, both from 0."""
+    axis = model.names.index(str(effect["axis"]))
+    words = str(effect.get("location") or "spring 1").split()
+    last = len(model.axes[axis].springs) - 1
+    place = int(words[1]) - 1 if len(words) == 2 and words[1].isdigit() else 0
+    return axis, max(min(place, last), 0)
+
+
+class _Parts:
+    """Matrices that grow with the effects."""
+
+    def __init__(self, model: MachineModel) -> None:
+        self.model = model
+        self.mass, self.damping = model.mass_matrix, model.damping_matrix
+        self.stiffness = model.stiffness_matrix
+        self.loss = np.zeros_like(self.mass)
+
+    def of_axis(self, effect: str, name: str, otherwise: float, count: int) -> FloatArray:
+        """Return one number an axis, of an effect that an axis has at most once."""
+        values = np.full(count, otherwise)
+        for one in self.model.effects:
+            if one.get("effect") == effect and one.get("axis") in self.model.names:
+                values[self.model.names.index(str(one["axis"]))] = number(one, name, otherwise)
+        return values
+
+    def add(self, effect: Mapping[str, Any]) -> None:
+        """Put one effect's linear part in."""
+        model, kind = self.model, effect.get("effect")
+        if kind in ("coupling_spring", "coupling_inertia"):
+            a, b = (self._mass(str(name), effect) for name in effect["axis"])
+            if kind == "coupling_inertia":
+                self.mass[a, b] += number(effect, "inertia")
+                self.mass[b, a] += number(effect, "inertia")
+            else:
+                _between(self.stiffness, a, b, number(effect, "stiffness"))
+        elif kind == "extra_mode":
+            self._hang(self._mass(str(effect["axis"]), effect), effect)
+        elif kind in ("stiffness_change", "structural_damping"):
+            axis, k = spring_of(model, effect)
+            if model.axes[axis].springs:
+                a = int(model.first_masses[axis]) + k
+                spring = model.axes[axis].springs[k].value
+                if kind == "stiffness_change":
+                    _between(self.stiffness, a, a + 1, spring * number(effect, "change"))
+                else:
+                    _between(self.loss, a, a + 1, spring * number(effect, "loss_factor"))
+        elif kind == "asymmetric_friction":
+            a = self._mass(str(effect["axis"]), effect)
+            both = number(effect, "viscous_positive") + number(effect, "viscous_negative")
+            self.damping[a, a] += max(both / 2, 0.0)
+
+    def _mass(self, axis: str, effect: Mapping[str, Any]) -> int:
+        k = self.model.names.index(axis)
+        at_motor = effect.get("location") == "motor"
+        if effect.get("effect") in ("coupling_spring", "coupling_inertia"):
+            at_motor = False  # they join last masses
+        elif effect.get("effect") == "asymmetric_friction":
+            at_motor = effect.get("location") != "load"
+        places = self.model.first_masses if at_motor else self.model.last_masses
+        return int(places[k])
+
+    def _hang(self, at: int, effect: Mapping[str, Any]) -> None:
+        """Add a mass on a spring; its degree of freedom is the last one."""
+        mass, w = number(effect, "mass"), 2 * np.pi * number(effect, "frequency")
+        if mass <= 0 or w <= 0:
+            return
+        n = self.mass.shape[0]
+        for name in ("mass", "damping", "stiffness", "loss"):
+            setattr(self, name, np.pad(getattr(self, name), (0, 1)))
+        self.mass[n, n] = mass
+        _between(self.stiffness, at, n, mass * w * w)
+        _between(self.damping, at, n, 2 * number(effect, "damping_ratio") * mass * w)
+
+
+def _between(matrix: FloatArray, a: int, b: int, value: float) -> None:
+    matrix[np.ix_([a, b], [a, b])] += value * np.array([[1.0, -1.0], [-1.0, 1.0]])

@@ -1,0 +1,285 @@
+"""What parameters will do, before they are written: margins, moves, steps, noise, with their spread."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from math import inf, isfinite, nan
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fieldtool.design.figures import (
+    MoveFigures,
+    StepFigures,
+    move_figures,
+    sensitivity_peak,
+    step_figures,
+)
+from fieldtool.design.loops import Loops, system_matrix
+from fieldtool.design.machine import Machine, machine_of, respond
+from fieldtool.design.margins import Margins, margins_of
+from fieldtool.design.moves import TestMove
+from fieldtool.design.servo import Servo
+from fieldtool.design.waves import HalfWave
+from fieldtool.records.model import FloatArray, MachineModel
+
+ComplexArray = NDArray[np.complexfloating[Any, Any]]
+GRID = 400
+BESIDE = np.linspace(-2.5, 2.5, 13)
+LIGHT = 0.3
+"""Damping ratio below which an eigenvalue gets frequencies of its own."""
+DECAYS = 6.0
+"""Time constants after which a response has come to rest."""
+MOST_SAMPLES = 2**14
+LONGEST = 60.0
+"""s: no response is looked at for longer."""
+SPREAD = (2.5, 97.5)
+"""Percentiles of what is told of uncertain models."""
+
+
+@dataclass(frozen=True, eq=False)
+class Curves:
+    """Histories of one axis, for pictures and comparison."""
+
+    time: FloatArray
+    """s."""
+    reference: FloatArray
+    """Of the move, rad or m, from 0."""
+    position: FloatArray
+    """Motor."""
+    load: FloatArray
+    """Last mass."""
+    torque: FloatArray
+    """N m or N."""
+    step_time: FloatArray
+    step: FloatArray
+    """Motor after a unit step of the reference, without feed-forward."""
+
+
+@dataclass(frozen=True, eq=False)
+class AxisPrediction:
+    """What one axis will do; SI."""
+
+    axis: str
+    margins: Margins
+    """Of the axis' loop with all others closed."""
+    move: MoveFigures | None
+    """The motor on the axis' move; None where the machine is not stable."""
+    load: MoveFigures | None
+    """The last mass on the same move."""
+    step: StepFigures | None
+    """The motor after a step of the reference, without feed-forward."""
+    compliance: float
+    """Largest motor position per torque at the motor over all frequencies, rad/(N m) or m/N."""
+    noise: float
+    """RMS of the torque that the encoder's steps make; NaN where the encoder is not known."""
+    peak_torque: float
+    """Largest torque of the move, N m or N; NaN where the machine is not stable."""
+    spread: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    """95 % ranges over the model's uncertainty: sensitivity_peak, settling_time, positioning_time,
+    overshoot (of the motor); empty where no samples were given."""
+    curves: Curves | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values without the histories; what is infinite or not known is null."""
+        data = {
+            "axis": self.axis,
+            "margins": self.margins.as_dict(),
+            "move": self.move.as_dict() if self.move else None,
+            "load": self.load.as_dict() if self.load else None,
+            "step": self.step.as_dict() if self.step else None,
+            "compliance": self.compliance,
+            "noise": self.noise,
+            "peak_torque": self.peak_torque,
+            "spread": {k: list(v) for k, v in self.spread.items()},
+        }
+        plain: dict[str, Any] = finite(data)
+        return plain
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """What all axes will do under one set of parameters."""
+
+    axes: tuple[AxisPrediction, ...]
+    stable: bool
+    sensitivity_peak: float
+    """Largest singular value of the sensitivity of all loops together, at the motors' torques."""
+
+    def of(self, axis: str) -> AxisPrediction:
+        """Return one axis by name; KeyError where there is none."""
+        for one in self.axes:
+            if one.axis == axis:
+                return one
+        raise KeyError(axis)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values."""
+        return {
+            "stable": self.stable,
+            "sensitivity_peak": finite(self.sensitivity_peak),
+            "axes": [axis.as_dict() for axis in self.axes],
+        }
+
+
+def predict(
+    model: MachineModel | Machine,
+    servos: Sequence[Servo],
+    moves: Sequence[TestMove],
+    *,
+    resolutions: Sequence[float] | None = None,
+    samples: Sequence[MachineModel | Machine] = (),
+) -> Prediction:
+    """Return what a machine does under its drives' loops.
+
+    Each axis makes its own move while the references of the others stand still, their loops closed.
+
+    Parameters
+    ----------
+    model
+        The machine, effects included where they are linear.
+    servos, moves
+        One an axis, in the model's order.
+    resolutions
+        One step of each axis' encoder, rad or m; NaN or None where it is not known.
+    samples
+        Models that are as likely as ``model``; the spread is that over them.
+    """
+    machine = model if isinstance(model, Machine) else machine_of(model)
+    servos = tuple(servos)
+    steps = [nan] * len(servos) if resolutions is None else list(resolutions)
+    values: ComplexArray = np.linalg.eigvals(system_matrix(machine, servos)).astype(np.complex128)
+    steady = bool(values.real.max() < 1e-9 * np.abs(values).max())
+    loops = Loops(respond(machine, frequencies(machine, values)), servos)
+    axes = []
+    spreads = _spreads(samples, servos, moves) if steady and samples else [{} for _ in servos]
+    for k, (servo, move) in enumerate(zip(servos, moves, strict=True)):
+        moved = _moved(machine, servos, k, move, values) if steady else None
+        axes.append(
+            AxisPrediction(
+                machine.names[k],
+                margins_of(loops.response.omega, loops.sensitivity[:, k]),
+                moved.motor if moved else None,
+                moved.load if moved else None,
+                moved.step if moved else None,
+                float(np.abs(loops.compliance[:, k, k]).max()),
+                servo.torque_noise(steps[k]) if isfinite(steps[k]) else nan,
+                moved.peak_torque if moved else nan,
+                spreads[k],
+                moved.curves if moved else None,
+            )
+        )
+    peak = sensitivity_peak(loops.input_sensitivity) if steady else inf
+    return Prediction(tuple(axes), steady, peak)
+
+
+def frequencies(machine: Machine, eigenvalues: ComplexArray) -> FloatArray:
+    """Return frequencies at which a closed machine shows all its peaks, rad/s, rising.
+
+    Parameters
+    ----------
+    machine
+        The machine.
+    eigenvalues
+        Of the closed loops, rad/s.
+    """
+    swinging = eigenvalues[eigenvalues.imag > 0]
+    size = np.abs(swinging) if swinging.size else np.abs(eigenvalues)
+    modes = np.concatenate([size, machine.modes, machine.held_modes])
+    slow = np.abs(eigenvalues.real)
+    low = 0.1 * min(modes.min(), slow[slow > 1e-6 * modes.max()].min())
+    high = 5.0 * min(modes.max(), 20 * max([*machine.modes, np.median(modes)]))
+    light = swinging[-swinging.real < LIGHT * np.abs(swinging)]
+    width = np.maximum(np.abs(light.real), 1e-3 * light.imag)
+    near = (light.imag[:, None] + width[:, None] * BESIDE).ravel()
+    open_modes = np.concatenate([machine.modes, machine.held_modes])
+    beside = (open_modes[:, None] * (1 + 0.004 * BESIDE)).ravel()
+    every = np.concatenate([np.geomspace(low, high, GRID), near, beside])
+    return np.unique(every[every > 0])
+
+
+@dataclass(frozen=True, eq=False)
+class _Moved:
+    motor: MoveFigures
+    load: MoveFigures
+    step: StepFigures
+    peak_torque: float
+    curves: Curves
+
+
+def _wave(values: ComplexArray, beyond: float, shortest: float) -> HalfWave:
+    """Return samples for a response of a machine with these eigenvalues.
+
+    Parameters
+    ----------
+    values
+        Eigenvalues, rad/s.
+    beyond
+        s, of the reference.
+    shortest
+        s: no sample is longer.
+    """
+    duration = beyond + min(DECAYS / max(-float(values.real.max()), 1e-6), LONGEST)
+    matters = np.abs(values)[-values.real < 1e3 / duration + 20 / beyond]
+    fastest = float(matters.max()) if matters.size else 1 / shortest
+    step = min(shortest, 0.5 / fastest)
+    samples = 2 ** int(np.ceil(np.log2(min(max(duration / step, 256), MOST_SAMPLES))))
+    return HalfWave(duration, samples)
+
+
+def _moved(
+    machine: Machine, servos: tuple[Servo, ...], axis: int, move: TestMove, values: ComplexArray
+) -> _Moved:
+    wave = _wave(values, move.duration, move.duration / 200)
+    drive = wave.spectrum(wave.move(move))
+    loops = Loops(respond(machine, wave.omega), servos)
+    s = 1j * wave.omega
+    motor, load, torque = (
+        wave.signal(one) for one in loops.motion(axis, servos[axis].reference_gain(s) * drive)
+    )
+    step = wave.spectrum(wave.step(1.0))
+    stepped = wave.signal(loops.motion(axis, servos[axis].step_gain(s) * step)[0]) + 0.5
+    half, time = 0.5 * move.distance, wave.time
+    reference = move.at(time)[0]
+    band = move.settling_band
+    curves = Curves(time, reference, motor + half, load + half, torque, time, stepped)
+    return _Moved(
+        move_figures(time, reference, curves.position, band),
+        move_figures(time, reference, curves.load, band),
+        step_figures(time, stepped, 1.0),
+        float(np.abs(torque).max()),
+        curves,
+    )
+
+
+def _spreads(
+    samples: Sequence[MachineModel | Machine], servos: tuple[Servo, ...], moves: Sequence[TestMove]
+) -> list[dict[str, tuple[float, float]]]:
+    found = [predict(sample, servos, moves) for sample in samples]
+    out = []
+    for k in range(len(servos)):
+        axes = [one.axes[k] for one in found]
+        figures = {
+            "sensitivity_peak": [a.margins.sensitivity_peak for a in axes],
+            "settling_time": [a.move.settling_time if a.move else inf for a in axes],
+            "positioning_time": [a.move.positioning_time if a.move else inf for a in axes],
+            "overshoot": [a.move.overshoot if a.move else inf for a in axes],
+        }
+        out.append({name: _range(values) for name, values in figures.items()})
+    return out
+
+
+def _range(values: Sequence[float]) -> tuple[float, float]:
+    low, high = np.percentile(values, SPREAD, method="nearest")
+    return float(low), float(high)
+
+
+def finite(data: Any) -> Any:
+    """Return plain values with None in place of what is infinite or no number."""
+    if isinstance(data, dict):
+        return {k: finite(v) for k, v in data.items()}
+    if isinstance(data, list | tuple):
+        return [finite(v) for v in data]
+    if isinstance(data, float):
+        return data if isfinite(data) else None
+    return data

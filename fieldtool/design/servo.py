@@ -1,0 +1,135 @@
+"""One drive's loops as they act on the machine: gains, filters, sampling and delay, by frequency.
+
+::
+
+    e      = position_p (r - q) + velocity_ff r' - v       v = low-pass( q' )
+    torque = delay( filters( velocity_p e + velocity_i integral(e) + inertia_ff r'' ) )
+
+A drive's loops are sampled.  At frequencies well below their rate the sampling shows as delays: half a
+period of the velocity's difference quotient, half a period that the torque is held, and the current
+loop's lag (Franklin, Powell, Workman, Digital Control of Dynamic Systems, 1998, section 5.8).
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fieldtool.records.closed_loop import AxisLoop, loop_from_parameters
+from fieldtool.records.model import FloatArray
+
+ComplexArray = NDArray[np.complexfloating[Any, Any]]
+CAUTIOUS_LAG = 1e-3
+"""s: from torque reference to torque, of a drive whose profile does not know it."""
+CAUTIOUS_PERIOD = 0.5e-3
+"""s: period of the loops of such a drive."""
+OFF = float("inf")
+
+
+@dataclass(frozen=True)
+class Timing:
+    """When a drive's loops act."""
+
+    lag: float = CAUTIOUS_LAG
+    """s, from the torque reference to the torque: computing, holding, current loop."""
+    period: float = CAUTIOUS_PERIOD
+    """s, of position and velocity loop."""
+    cycle: float = 0.0
+    """s, from one cyclic target to the next: the reference's acceleration is held so long; 0: it
+    is followed at once."""
+
+
+@dataclass(frozen=True)
+class Servo:
+    """One axis' controller in its drive, SI."""
+
+    loop: AxisLoop
+    velocity_filter: float = OFF
+    """First-order low-pass on the measured velocity, Hz; infinite: none."""
+    timing: Timing = Timing(0.0, 0.0)
+
+    def gain(self, s: ComplexArray) -> ComplexArray:
+        """Return torque per position error of the standing reference, shape of ``s``, rad/s."""
+        position = self.loop.position_p + s * self._velocity(s)
+        return self._torque(s) * self._pi(s) * position
+
+    def reference_gain(self, s: ComplexArray) -> ComplexArray:
+        """Return torque per reference with the axis locked, shape of ``s``, rad/s."""
+        loop = self.loop
+        followed = self._pi(s) * (loop.position_p + loop.velocity_ff * s)
+        return self._torque(s) * (followed + loop.inertia_ff * s * s * self._held(s))
+
+    def step_gain(self, s: ComplexArray) -> ComplexArray:
+        """Return torque per reference without feed-forward, as a step of the reference needs it."""
+        return self._torque(s) * self._pi(s) * self.loop.position_p
+
+    def _pi(self, s: ComplexArray) -> ComplexArray:
+        return self.loop.velocity_p + self.loop.velocity_i / s
+
+    def _velocity(self, s: ComplexArray) -> ComplexArray:
+        late: ComplexArray = np.exp(-0.5 * self.timing.period * s)
+        if self.velocity_filter == OFF:
+            return late
+        return np.asarray(late / (1 + s / (2 * np.pi * self.velocity_filter)))
+
+    def _torque(self, s: ComplexArray) -> ComplexArray:
+        gain: ComplexArray = np.exp(-self.timing.lag * s)
+        for biquad in self.loop.filters:
+            gain = gain * biquad.response(s)
+        return gain
+
+    def _held(self, s: ComplexArray) -> ComplexArray:
+        x = self.timing.cycle * s
+        return np.where(np.abs(x) < 1e-6, 1.0, -np.expm1(-x) / np.where(x == 0, 1.0, x))
+
+    def torque_noise(self, resolution: float) -> float:
+        """Return the RMS of the torque reference that an encoder's steps make at standstill, N m or N.
+
+        The rounding of positions is taken as white noise of a step / sqrt(12) at the loops' rate; the
+        machine does not answer at the high frequencies that matter.
+
+        Parameters
+        ----------
+        resolution
+            One step of the encoder, rad or m.
+        """
+        period = self.timing.period or CAUTIOUS_PERIOD
+        nyquist = np.pi / period
+        omega = np.geomspace(nyquist / 1e4, nyquist, 300)
+        s = 1j * omega
+        rate: ComplexArray = (1 - np.exp(-period * s)) / period
+        velocity = rate
+        if self.velocity_filter != OFF:
+            share = -np.expm1(-2 * np.pi * self.velocity_filter * period)
+            velocity = rate * share / (1 - (1 - share) * np.exp(-period * s))
+        gain = self._torque(s) * self.loop.velocity_p * (self.loop.position_p + velocity)
+        power = np.trapezoid(np.abs(gain) ** 2, omega) / nyquist
+        return float(resolution / np.sqrt(12) * np.sqrt(power))
+
+
+def servo_from_parameters(values: Mapping[str, float], timing: Timing) -> Servo:
+    """Return the controller that a drive's parameters describe.
+
+    Parameters
+    ----------
+    values
+        As :func:`fieldtool.records.closed_loop.loop_from_parameters` has them, and where there is
+        one ``velocity_filter``, Hz (0 or infinite: off).
+    timing
+        Of the drive.
+
+    Raises
+    ------
+    KeyError
+        If a loop gain is missing.
+    """
+    corner = values.get("velocity_filter", OFF)
+    return Servo(loop_from_parameters(values), corner if corner > 0 else OFF, timing)
+
+
+def gains_of(servos: tuple[Servo, ...], omega: FloatArray) -> ComplexArray:
+    """Return all axes' torque per position error, shape (F, M), at ``omega``, rad/s."""
+    s = 1j * omega
+    return np.column_stack([servo.gain(s) for servo in servos])

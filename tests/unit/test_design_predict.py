@@ -1,0 +1,243 @@
+"""Predictions against three other routes: margins by hand, a state space in time, simulated firmware."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from drives.sim.firmware import DriveHardware, Parameter, SimulatedAxes
+from drives.sim.plant import ChainParameters, PlantParameters
+from fieldtool.design.loops import Loops, stable, system_matrix
+from fieldtool.design.machine import machine_of, respond
+from fieldtool.design.margins import margins_of
+from fieldtool.design.moves import TestMove, typical_move
+from fieldtool.design.predict import predict
+from fieldtool.design.rule import rule, sensitivity_peak
+from fieldtool.design.servo import Servo, Timing, servo_from_parameters
+from fieldtool.records.closed_loop import AxisLoop, Biquad, ClosedLoop
+from fieldtool.records.model import AxisModel, Estimate, MachineModel
+
+RandomModel = Callable[..., MachineModel]
+LENGTHS = [(1,), (2,), (3,), (2, 1), (1, 3), (2, 3, 1)]
+
+
+def moves_of(model: MachineModel) -> list[TestMove]:
+    return [typical_move(a.name, (-2, 2), 4.0, 40.0, 100.0, a.total_mass) for a in model.axes]
+
+
+def test_margins_of_an_integrator_with_delay() -> None:
+    """L = K exp(-s T) / s: phase margin 90 - K T, gain margin pi / (2 K T), both by hand."""
+    K, T = 10.0, 0.05
+    omega = np.geomspace(0.1, 500, 4000)
+    L = K * np.exp(-1j * omega * T) / (1j * omega)
+    found = margins_of(omega, 1 / (1 + L))
+    assert found.phase_margin == pytest.approx(90 - np.degrees(K * T), abs=0.1)
+    assert found.delay_margin == pytest.approx((np.pi / 2 - K * T) / K, rel=0.005)
+    assert found.gain_margin == pytest.approx(np.pi / (2 * K * T), rel=0.01)
+    assert found.gain_reduction == 0.0
+    assert found.sensitivity_peak == pytest.approx(np.abs(1 / (1 + L)).max())
+
+
+@pytest.mark.parametrize("lengths", LENGTHS, ids=str)
+def test_without_delay_as_the_state_space_in_time(
+    lengths: tuple[int, ...], random_model: RandomModel, fresh_rng: np.random.Generator
+) -> None:
+    """The move by sines that go there and back, and by matrix exponentials from rest."""
+    model = random_model(fresh_rng, lengths, friction=bool(fresh_rng.integers(2)))
+    loops = [replace(loop, inertia_ff=0.0) for loop in rule(model)]
+    servos = [Servo(loop) for loop in loops]
+    moves = moves_of(model)
+    found = predict(model, servos, moves)
+    assert found.stable == ClosedLoop(model, tuple(loops)).stable
+    for k, axis in enumerate(found.axes):
+        assert axis.margins.sensitivity_peak == pytest.approx(
+            sensitivity_peak(model, loops, k), rel=0.02
+        )
+        step = 5e-4
+        references = np.zeros((int(axis.curves.time[-1] / step) + 1, len(lengths)))
+        t = np.arange(references.shape[0]) * step
+        references[:, k] = moves[k].at(t)[0]
+        position, torque = ClosedLoop(model, tuple(loops)).simulate(references, step)
+        size = np.abs(references[:, k] - position[:, k]).max()
+        there = np.interp(t, axis.curves.time, axis.curves.position)
+        assert there == pytest.approx(position[:, k], abs=0.02 * size)
+        # the torque's stairs in the one come from its reference's corners
+        assert axis.peak_torque == pytest.approx(np.abs(torque[:, k]).max(), rel=0.05)
+
+
+@pytest.mark.parametrize("lengths", [(2,), (1, 2)], ids=str)
+def test_stability_and_sensitivity_as_the_eigenvalues_say(
+    lengths: tuple[int, ...], random_model: RandomModel, fresh_rng: np.random.Generator
+) -> None:
+    """Gains raised until the eigenvalues cross: the sensitivity's peak grows beyond all bounds there."""
+    model = random_model(fresh_rng, lengths)
+    machine = machine_of(model)
+    timing = Timing(2e-3, 1e-3)
+    loops = rule(model)
+
+    def servos(factor: float) -> tuple[Servo, ...]:
+        first = replace(loops[0], velocity_p=factor * loops[0].velocity_p)
+        return tuple(Servo(x, 200.0, timing) for x in (first, *loops[1:]))
+
+    low, high = 1.0, 1e4
+    assert stable(machine, servos(low))
+    assert not stable(machine, servos(high))
+    for _ in range(60):
+        middle = np.sqrt(low * high)
+        low, high = (middle, high) if stable(machine, servos(middle)) else (low, middle)
+    values = np.linalg.eigvals(system_matrix(machine, servos(low)))
+    w = abs(values[np.argmax(values.real)].imag)
+    near = Loops(respond(machine, w * np.linspace(0.98, 1.02, 4001)), servos(low))
+    assert np.abs(near.sensitivity[:, 0]).max() > 30
+    # and the loop's margin tells the factor from afar
+    margin = predict(model, servos(1.0), moves_of(model)).axes[0].margins.gain_margin
+    assert margin == pytest.approx(low, rel=0.05)
+
+
+def test_the_delay_of_the_state_space_is_that_of_the_frequency_response() -> None:
+    """exp(A t) of the closed loops against the inverse transform of the frequency response."""
+    chain = AxisModel(
+        "x", "rotary", (Estimate(0.02), Estimate(0.03)), (Estimate(190.0),), (Estimate(0.05),)
+    )
+    machine = machine_of(MachineModel((chain,)))
+    loop = AxisLoop(12.0, 1.2, 10.0, filters=(Biquad.notch(20.0, 0.2, 0.7),))
+    servo = Servo(loop, 150.0, Timing(1e-3, 0.5e-3))
+    A = system_matrix(machine, (servo,))
+    kick = np.zeros(A.shape[0])
+    kick[2] = 1 / 0.02  # an impulse of torque at the motor
+    omega = np.arange(1, 60000) * 2 * np.pi / 30.0
+    compliance = Loops(respond(machine, omega), (servo,)).compliance[:, 0, 0]
+    for t in (0.02, 0.1, 0.35):
+        by_time = float((expm(A * t) @ kick)[0])
+        by_frequency = float(np.sum((compliance * np.exp(1j * omega * t)).real) * 2 / 30.0)
+        assert by_time == pytest.approx(by_frequency, abs=1e-3)
+
+
+@pytest.mark.parametrize("lengths", [(1,), (2,), (2, 1), (2, 3)], ids=str)
+def test_simulated_firmware_does_as_predicted(
+    lengths: tuple[int, ...], random_model: RandomModel, fresh_rng: np.random.Generator
+) -> None:
+    """Sampled loops, rounded positions, stairs of torque: the figures are those predicted."""
+    model = random_model(fresh_rng, lengths)
+    cycle, rate = 0.004, 8000.0
+    values = [
+        {
+            "position_p": loop.position_p,
+            "velocity_p": loop.velocity_p,
+            "velocity_i": loop.velocity_i,
+            "velocity_ff": 1.0,
+            "inertia_ff": 0.7 * loop.inertia_ff,
+            "velocity_filter": float(fresh_rng.uniform(40, 400)),
+            "filter1_type": 2.0,
+            "filter1_frequency": float(fresh_rng.uniform(60, 200)),
+            "filter1_zero_damping": 0.1,
+            "filter1_pole_damping": 0.7,
+        }
+        for loop in rule(model)
+    ]
+    timing = Timing(0.22e-3, 1 / rate, cycle)
+    servos = [servo_from_parameters(v, timing) for v in values]
+    moves = moves_of(model)
+    found = predict(model, servos, moves)
+    if not found.stable:
+        pytest.skip("a random filter makes this machine unstable")
+    chains = tuple(
+        ChainParameters(
+            *(tuple(e.value for e in part) for part in (a.masses, a.springs, a.dampers))
+        )
+        for a in model.axes
+    )
+    names = model.names
+    couplings = tuple(
+        (names.index(c.axes[0]), names.index(c.axes[1]), c.value) for c in model.couplings
+    )
+    hardware = DriveHardware(1000.0, 0.0, 2**23 / (2 * np.pi))
+    k = int(fresh_rng.integers(len(lengths)))
+    axes = SimulatedAxes(PlantParameters(chains, couplings), [hardware] * len(lengths), 1, rate)
+    for i, one in enumerate(values):
+        for name, value in one.items():
+            axes.set(i, Parameter[name.upper()], value)
+        axes.follow_position(i, 0.0, 32)
+    targets = moves[k].reference(cycle)
+    count = int(found.axes[k].curves.time[-1] / cycle)
+    position = np.zeros(count)
+    for n in range(count):
+        position[n] = axes.position(k)
+        # a target is reached a cycle after it was sent
+        for i in range(len(lengths)):
+            target = targets[min(n + 1, targets.size - 1)] if i == k else 0.0
+            axes.follow_position(i, target, 32)
+        axes.advance(32)
+    t = np.arange(count) * cycle
+    expected = np.interp(t, found.axes[k].curves.time, found.axes[k].curves.position)
+    size = found.axes[k].move.following_error
+    assert position == pytest.approx(expected, abs=0.03 * size + 1e-5)
+
+
+def test_noise_of_an_encoder_as_the_firmware_makes_it() -> None:
+    """A velocity of 1e-3 of a count a step dithers the count; torque noise is its RMS."""
+    rng = np.random.default_rng(3)
+    step, rate = 1e-4, 8000.0
+    servo = Servo(AxisLoop(30.0, 2.0, 0.0), 100.0, Timing(0.0, 1 / rate))
+    rounded = step * (rng.random(400_000) - 0.5)
+    velocity = np.diff(rounded, prepend=0.0) * rate
+    share = 1 - np.exp(-2 * np.pi * 100.0 / rate)
+    filtered = np.zeros_like(velocity)
+    for n in range(1, velocity.size):
+        filtered[n] = filtered[n - 1] + share * (velocity[n] - filtered[n - 1])
+    torque = 2.0 * (30.0 * rounded + filtered)
+    assert servo.torque_noise(step) == pytest.approx(torque[100:].std(), rel=0.03)
+
+
+def test_an_unstable_machine_has_no_moves() -> None:
+    model = MachineModel(
+        (
+            AxisModel(
+                "x", "rotary", (Estimate(1.0), Estimate(1.0)), (Estimate(400.0),), (Estimate(0.01),)
+            ),
+        )
+    )
+    servo = Servo(AxisLoop(50.0, 500.0, 9000.0), 10.0, Timing())
+    (axis,) = predict(model, [servo], moves_of(model)).axes
+    found = predict(model, [servo], moves_of(model))
+    assert not found.stable
+    assert axis.move is None
+    assert found.as_dict()["sensitivity_peak"] is None
+    assert found.of("x").as_dict()["move"] is None
+
+
+def test_effects_of_an_extended_model_act() -> None:
+    """Lag, scale, an added mode, a coupling spring: each as written by hand into the equations."""
+    one = AxisModel("x", "rotary", (Estimate(1.0),), ())
+    other = AxisModel("y", "rotary", (Estimate(2.0),), ())
+    effects = (
+        {
+            "effect": "torque_lag",
+            "axis": "x",
+            "parameters": {"time": {"value": 0.01, "std": 1e-4, "unit": "s"}},
+        },
+        {"effect": "torque_scale", "axis": "x", "parameters": {"scale": 1.2}},
+        {
+            "effect": "extra_mode",
+            "axis": "y",
+            "location": "load",
+            "parameters": {"mass": 0.5, "frequency": 3.0, "damping_ratio": 0.1},
+        },
+        {
+            "effect": "coupling_spring",
+            "axis": ["x", "y"],
+            "location": "load",
+            "parameters": {"stiffness": 7.0},
+        },
+    )
+    machine = machine_of(MachineModel((one, other), (), effects))
+    w = 2 * np.pi * 2.0
+    s, spring = 1j * w, 0.5 * (6 * np.pi) ** 2
+    damper = 2 * 0.1 * 0.5 * 6 * np.pi
+    hung = 0.5 * s**2 * (spring + damper * s) / (0.5 * s**2 + spring + damper * s)
+    by_hand = np.linalg.inv(
+        np.array([[s**2 + 7.0, -7.0], [-7.0, 2 * s**2 + hung + 7.0]])
+    ) @ np.diag([1.2 / (1 + 0.01 * s), 1.0])
+    assert respond(machine, np.array([w])).motors[0] == pytest.approx(by_hand)
