@@ -25,24 +25,90 @@ no low-pass near the SYNC rate, d below T.
 
 A drive that can not be kept from feeding the reference's velocity forward, as one whose loop is a PID
 with D on the error, adds velocity_p times a staircase: the slope of the straight line from target to
-target.  That is a torque held from SYNC to SYNC.
+target.  That is a torque held from SYNC to SYNC.  It is sampled (1/2 - d / T) T = c T after the middle
+of its tread, so it shows S (c w T j - (c^2 / 2 + 1/24) (w T)^2) too little, S the phasor of the stair:
+:func:`held_offset` to second order.  Of the inner sampling that is in the lag of everything that is
+measured the stair has nothing, so c is not known better than ``STAIR_UNSURE``.
+
+Where it is not known how a drive goes from target to target, its share of the bends may be that of
+any lag, or nothing where it bends smoothly, and c anything that a lag below the period makes; the fit
+of whole records finds what it really is (:class:`Fold`).
 
 Torque offsets are held from SYNC to SYNC; see :func:`held_offset`.
 """
 
+from dataclasses import dataclass
+from typing import Literal
+
 import numpy as np
 
+from fieldtool.errors import NotEnoughDataError
 from fieldtool.frf.phasors import ComplexArray, FloatArray
 from fieldtool.records.recorded import Experiment, Recording, Segment
 
 LINEAR_TARGETS = "linear_targets"
 """Key of a recording's source: ``AXIS=LAG`` of the axes whose drives interpolate linearly, LAG the
 torque's lag in s, with blanks between; ``AXIS=LAG/SHARE`` where the drive feeds that share of the
-reference's velocity forward."""
+reference's velocity forward; LAG is ``?`` where it is not known how the drive interpolates."""
 LEAST_UNSURE = 0.05
 """Of the bends: error of the share that is seen where there is hardly a lag."""
-STAIR_UNSURE = 0.02
-"""Of a stair's step: error of what is seen of it."""
+STAIR_UNSURE = 0.1
+"""Of a stair's c: inner sampling and current loop share the lag."""
+BENDS_UNKNOWN = 0.0, 0.45
+"""Share of the bends that is seen, and its error: mean and deviation over all lags up to a period."""
+STAIR_UNKNOWN = 0.25, 0.25
+"""A stair's c, and its error: the lag is a quarter of the period, give or take as much."""
+
+
+@dataclass(frozen=True)
+class Fold:
+    """Something that an axis' sampled torque shows and that does not act, of a size to be found."""
+
+    axis: int
+    kind: Literal["bends", "stair"]
+    gain: float
+    """N m s/rad (N s/m) a s for bends, N m (N) a rad (m) of the reference's step for a stair."""
+    size: float
+    """Share of the bends, or a stair's c, as it was expected."""
+    std: float
+    """Error of that."""
+
+    def course(self, reference: FloatArray, size: float) -> FloatArray:
+        """What is shown, row by row, (n,), N m or N, for a motion that need not repeat.
+
+        (w T)^2 times a sine is what its targets bend from one SYNC to the next.
+        """
+        return self._made_of(reference, size, size**2 / 2 + 1 / 24)
+
+    def slope(self, reference: FloatArray, size: float) -> FloatArray:
+        """Derivative of :meth:`course` by the size."""
+        return self._made_of(reference, 1.0, size)
+
+    def _made_of(self, reference: FloatArray, first: float, second: float) -> FloatArray:
+        shown = np.zeros(reference.size)
+        step = np.diff(reference)
+        if self.kind == "bends":
+            shown[2:] = -self.gain / 12 * first * np.diff(step)
+        else:
+            middle = (step[2:] - step[:-2]) / 2
+            shown[3:] = -self.gain * (first * middle + second * np.diff(step, 2))
+        return shown
+
+
+def folds(recording: Recording) -> tuple[Fold, ...]:
+    """Return what sampled torques show besides what acts: of each axis its bends and its stair."""
+    period, found = recording.sample_period, []
+    for axis, information in enumerate(recording.axes):
+        handling, controller = handlings(recording).get(information.name), information.controller
+        if handling is None or controller is None:
+            continue
+        if controller.position_p:
+            gain = controller.velocity_p * controller.position_p
+            found.append(Fold(axis, "bends", gain, *handling.bends(period)))
+        if handling.share:
+            gain = controller.velocity_p * handling.share / period
+            found.append(Fold(axis, "stair", gain, *handling.stair(period)))
+    return tuple(found)
 
 
 def folded_torque(
@@ -54,7 +120,7 @@ def folded_torque(
     or the reference.
     """
     reference = experiment.position_reference
-    if reference is None or recording.axes[axis].name not in lags(recording):
+    if reference is None or recording.axes[axis].name not in handlings(recording):
         return 0j
     rows = slice(segment.start, segment.stop)
     omega = 2 * np.pi * segment.frequency
@@ -89,58 +155,64 @@ def folded_phasors(
     omega = 2 * np.pi * frequencies
     folded = np.zeros(reference.shape, dtype=np.complex128)
     for axis, information in enumerate(recording.axes):
-        lag, controller = lags(recording).get(information.name), information.controller
-        if lag is None or controller is None:
+        handling, controller = handlings(recording).get(information.name), information.controller
+        if handling is None or controller is None:
             continue
         # A target sent with one SYNC is reached at the next one.
         reached = reference[:, axis] * np.exp(-1j * omega * period)
-        lost = (omega * period) ** 2 / 12 * _seen(lag / period)[0]
+        lost = (omega * period) ** 2 / 12 * handling.bends(period)[0]
         folded[:, axis] = controller.velocity_p * controller.position_p * reached * lost
-        share = shares(recording)[information.name]
-        if share:
+        if handling.share:
             slope = reference[:, axis] * (1 - np.exp(-1j * omega * period)) / period
-            stair = (share * controller.velocity_p * slope)[:, None]
-            sampled = period - min(lag, period)
+            stair = (handling.share * controller.velocity_p * slope)[:, None]
+            sampled = period * (0.5 + handling.stair(period)[0])
             folded[:, axis] -= held_offset(frequencies, stair, period, sampled)[:, 0]
     return folded
 
 
-def bends(recording: Recording, experiment: Experiment) -> FloatArray:
-    """Return what torques would show of the bends without lag, row by row, (n, M), N m or N.
+@dataclass(frozen=True)
+class Handling:
+    """How a drive goes from one cyclic target to the next."""
 
-    Times the share of :func:`bends_seen` it is the same as :func:`folded_phasors`, for motion that need
-    not repeat: (w T)^2 times a sine is what its targets bend from one SYNC to the next.
+    lag: float | None
+    """Of the torque, s, where it goes straight; None where that is not known."""
+    share: float = 0.0
+    """Of the reference's velocity, fed forward."""
+
+    def bends(self, period: float) -> tuple[float, float]:
+        """Share of the bends that the sampled torque shows, and its error."""
+        return BENDS_UNKNOWN if self.lag is None else _seen(self.lag / period)
+
+    def stair(self, period: float) -> tuple[float, float]:
+        """When a stair is sampled, in periods after the middle of its tread, and its error."""
+        if self.lag is None:
+            return STAIR_UNKNOWN
+        return 0.5 - min(self.lag / period, 1.0), STAIR_UNSURE
+
+
+def handlings(recording: Recording) -> dict[str, Handling]:
+    """Return what the recording says of drives that go straight from target to target, or may.
+
+    Raises
+    ------
+    NotEnoughDataError
+        If it can not be read.
     """
-    reference = experiment.position_reference
-    course = np.zeros(experiment.torque.shape)
-    if reference is None:
-        return course
-    for axis, information in enumerate(recording.axes):
-        controller = information.controller
-        known = information.name in lags(recording) and controller is not None
-        if controller is None or not known or np.any(np.isnan(reference[:, axis])):
-            continue
-        gain = controller.velocity_p * controller.position_p / 12
-        course[2:, axis] = -gain * np.diff(reference[:, axis], 2)
-    return course
-
-
-def bends_seen(recording: Recording) -> tuple[FloatArray, FloatArray]:
-    """Return the share of the bends that each axis' sampled torque shows, and its error, (M,) each.
-
-    A stair that velocity feed-forward makes counts as bends too: its value is that of its middle, and
-    is sampled (T - lag) after its begin, which a low-pass instead of a delay hardly changes.
-    """
-    period, found = recording.sample_period, np.zeros((2, len(recording.axes)))
-    for axis, information in enumerate(recording.axes):
-        lag, controller = lags(recording).get(information.name), information.controller
-        if lag is None or controller is None or controller.position_p == 0.0:
-            continue
-        value, std = _seen(lag / period)
-        steps = 12 * shares(recording)[information.name] / (controller.position_p * period)
-        late = min(lag / period, 1.0) - 0.5
-        found[:, axis] = value - steps * late, np.hypot(std, steps * STAIR_UNSURE)
-    return found[0], found[1]
+    found = {}
+    for item in str(recording.source.get(LINEAR_TARGETS, "")).split():
+        name, _, numbers = item.rpartition("=")
+        lag, _, share = numbers.partition("/")
+        try:
+            one = Handling(None if lag == "?" else float(lag), float(share or 0.0))
+        except ValueError:
+            one = Handling(-1.0)
+        if not (0 <= (one.lag or 0.0) < np.inf and np.isfinite(one.share)):
+            raise NotEnoughDataError(
+                f"the recording's source, {LINEAR_TARGETS}: {item!r} is no AXIS=LAG or AXIS=LAG/SHARE "
+                "with LAG in seconds, or ?. Put it right in recording.yaml, or leave it out."
+            )
+        found[name] = one
+    return found
 
 
 def _seen(lag: float) -> tuple[float, float]:
@@ -197,21 +269,3 @@ def held_offset(
     mean = np.sinc(omega * period / (2 * np.pi)) * np.exp(-1j * omega * (period / 2 - sampled))
     correction: ComplexArray = held * (mean - 1)
     return correction
-
-
-def lags(recording: Recording) -> dict[str, float]:
-    """Return the torque's lag, s, of the axes whose drives interpolate linearly, by name."""
-    found = {}
-    for item in str(recording.source.get(LINEAR_TARGETS, "")).split():
-        name, _, numbers = item.rpartition("=")
-        found[name] = float(numbers.partition("/")[0])
-    return found
-
-
-def shares(recording: Recording) -> dict[str, float]:
-    """Return the share of the reference's velocity that those drives feed forward, by name."""
-    found = {}
-    for item in str(recording.source.get(LINEAR_TARGETS, "")).split():
-        name, _, numbers = item.rpartition("=")
-        found[name] = float(numbers.partition("/")[2] or 0.0)
-    return found

@@ -88,8 +88,7 @@ def recording_header(
     linear = [
         _linear_targets(d)
         for d in group.drives
-        if d.profile.interpolation == "linear"
-        and not smooth(loop_from_parameters(read_loop(d)), 2 * np.pi / cycle_time)
+        if not smooth(loop_from_parameters(read_loop(d)), 2 * np.pi / cycle_time)
     ]
     if linear:
         source[LINEAR_TARGETS] = " ".join(linear)
@@ -97,8 +96,9 @@ def recording_header(
 
 
 def _linear_targets(drive: CanopenDrive) -> str:
-    """Return what a recording says of a drive that goes straight from target to target."""
-    lag = f"{drive.axis}={drive.profile.torque_lag!r}"
+    """Return what a recording says of a drive that goes straight from target to target, or may."""
+    known = drive.profile.interpolation == "linear"
+    lag = f"{drive.axis}={drive.profile.torque_lag if known else '?'}"
     if "velocity_ff" in drive.profile.feed_forward:
         return lag  # it is switched off while frequency responses are measured
     share = read_loop(drive).get("velocity_ff", 0.0)

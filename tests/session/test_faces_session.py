@@ -22,16 +22,16 @@ from tests.faces import machine_of, simulated
 
 pytestmark = pytest.mark.timeout(900)  # a busy computer plans and fits slowly
 PAIRS = {
-    "epos4": ("epos4*", "reference"),
+    "epos4": ("epos4", "reference"),
     "novanta": ("novanta*", "epos4-dual-loop"),
     "elmo": ("elmo-gold", "nanotec*"),
 }
 """A star: the packaged profile with its unknown facts filled in.  All kinds, and how each compares
 with the reference drive: benchmark ``faces``."""
 WRITTEN = ("epos4", "novanta")
-CLOSE = {"epos4": 5e-3}
-"""Relative; a PID with D on the error feeds the reference's velocity forward in steps, and what they
-do within one SYNC is taken off to first order.  Else 2e-4: rounding and noise."""
+CLOSE = {"epos4": 1e-3}
+"""Relative; a PID with D on the error feeds the reference's velocity forward in steps, and how they are
+sampled is not known but found from the data.  Else 3e-4: rounding and noise."""
 GAINS = ("position_p", "velocity_p", "velocity_i", "inertia_ff")
 
 

@@ -98,6 +98,8 @@ class TorquePart:
     """Of what is not known of its size."""
     spectra: tuple[ComplexArray, ...]
     """(F,) of each stretch, N m or N a unit of size."""
+    beside: float = 0.0
+    """By how much the size that was taken off is beside what was expected before."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,8 +133,22 @@ class RecordData:
 
         After those of all stretches comes one of each part: its size in standard errors.
         """
-        rows = np.concatenate([one.residuals for one in self.systems(model, delays)])
-        return self._left(rows, model, delays)
+        wide = self._with_parts(model, delays)
+        span = self._span(model, delays)
+        left: FloatArray = wide - span @ (span.T @ wide)
+        return left
+
+    def part_sizes(self, model: MachineModel, delays: FloatArray) -> FloatArray:
+        """Return by how much the size of each torque part is larger than what was taken off, (P,)."""
+        if not self.parts:
+            return np.zeros(0)
+        columns, wide = self._columns(model, delays), self._with_parts(model, delays)
+        return -np.asarray(np.linalg.lstsq(columns, wide, rcond=None)[0], dtype=np.float64)
+
+    def _with_parts(self, model: MachineModel, delays: FloatArray) -> FloatArray:
+        """Residuals with the torque parts' sizes as they were taken off."""
+        rows = [one.residuals for one in self.systems(model, delays)]
+        return np.concatenate([*rows, [part.beside / part.std for part in self.parts]])
 
     def jacobian(
         self,
@@ -143,22 +159,26 @@ class RecordData:
     ) -> FloatArray:
         """Derivatives of :meth:`residuals` by the parameters, SI."""
         rows = [one.jacobian(parameters) for one in self.systems(model, delays)]
-        return self._left(np.concatenate(rows), model, delays)
+        wide = np.concatenate([*rows, np.zeros((len(self.parts), len(parameters)))])
+        span = self._span(model, delays)
+        left: FloatArray = wide - span @ (span.T @ wide)
+        return left
 
-    def _left(self, rows: FloatArray, model: MachineModel, delays: FloatArray) -> FloatArray:
-        """Rows (R,) or (R, P), those of the parts added, without what sizes of parts can explain."""
-        if not self.parts:
-            return rows
+    def _columns(self, model: MachineModel, delays: FloatArray) -> FloatArray:
+        """Derivatives of all residuals by the sizes of the torque parts, (R + P, P)."""
         systems = self.systems(model, delays)
         columns = [
             np.concatenate([one.part(p.axis, p.spectra[k]) for k, one in enumerate(systems)])
             for p in self.parts
         ]
         known = np.diag([1.0 / p.std for p in self.parts])
-        span = np.linalg.qr(np.vstack([np.stack(columns, axis=1), known]))[0]
-        wide = np.concatenate([rows, np.zeros((len(self.parts), *rows.shape[1:]))])
-        left: FloatArray = wide - span @ (span.T @ wide)
-        return left
+        return np.asarray(np.vstack([np.stack(columns, axis=1), known]), dtype=np.float64)
+
+    def _span(self, model: MachineModel, delays: FloatArray) -> FloatArray:
+        """What sizes of torque parts can explain, an orthonormal basis, (R + P, P)."""
+        if not self.parts:
+            return np.zeros((sum(2 * one.position.size for one in self.spectra), 0))
+        return np.asarray(np.linalg.qr(self._columns(model, delays))[0], dtype=np.float64)
 
     def systems(self, model: MachineModel, delays: FloatArray) -> "list[RecordSystem]":
         """Return each stretch at one machine; the last machine's are kept."""

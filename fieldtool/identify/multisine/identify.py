@@ -404,9 +404,10 @@ def _with_free_motion(
     still = [f"{axis.name}.viscous_friction" for axis in axes if not axis.viscous_friction.value]
     found = start
     for _ in range(WEIGHTINGS):
+        data = records.data(found, run_in=not np.any(records.friction))
         found = refine(
             found.model,
-            records.data(found, run_in=not np.any(records.friction)),
+            data,
             fixed=still,
             priors=priors,
             fit_delay=True,
@@ -414,6 +415,7 @@ def _with_free_motion(
             fit_load_friction=any(axis.load_friction.value for axis in axes),
             delays=found.delay_values.tolist(),
         )
+        records = records.sized(data, found)
     return found
 
 

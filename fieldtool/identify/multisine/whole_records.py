@@ -7,12 +7,12 @@ it are averaged over neighbouring bins.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fieldtool.frf.held_targets import bends, bends_seen
+from fieldtool.frf.held_targets import Fold, folds
 from fieldtool.frf.multisine.lines import LinePhasors, same_level
 from fieldtool.frf.multisine.transient import windows
 from fieldtool.frf.phasors import equation_errors
@@ -52,6 +52,8 @@ class WholeRecords:
     """Of each experiment used."""
     friction: FloatArray
     """(M,), N m or N: dry friction that is taken off the torques."""
+    sizes: tuple[float, ...] | None = None
+    """Of the folds, as far as they are known by now; None: as they are expected."""
 
     @classmethod
     def of(
@@ -62,6 +64,13 @@ class WholeRecords:
         for k in friction.seen(SEEN):
             taken[k] = friction.torque[k].value
         return cls(recording, tuple(lines), taken)
+
+    @property
+    def folds(self) -> tuple[tuple[Fold, float], ...]:
+        """What sampled torques show besides what acts, and of what size: it is taken off."""
+        found = folds(self.recording)
+        sizes = tuple(one.size for one in found) if self.sizes is None else self.sizes
+        return tuple(zip(found, sizes, strict=True))
 
     @property
     def too_long(self) -> bool:
@@ -98,7 +107,9 @@ class WholeRecords:
     def _spectrum(self, one: LinePhasors, *, run_in: bool, beyond: bool) -> Spectrum:
         """Spectrum up to the highest line, or as far beyond it as the noise is wanted."""
         experiment, step = one.given.experiment, self.recording.sample_period
-        torque = experiment.torque - self._bends(one) * bends_seen(self.recording)[0]
+        torque = experiment.torque.copy()
+        for fold, size in self.folds:
+            torque[:, fold.axis] -= fold.course(self._reference(one, fold.axis), size)
         if np.any(self.friction):
             signs = signs_of_velocity(experiment, step, float(one.frequencies[-1]))
             torque = torque - signs * self.friction
@@ -106,19 +117,32 @@ class WholeRecords:
         signals, bins = self._cut(one, np.hstack([experiment.position, torque]), run_in, beyond)
         return spectrum_of(signals[:, :M], signals[:, M:], step, bins)
 
-    def _bends(self, one: LinePhasors) -> FloatArray:
-        return bends(self.recording, one.given.experiment)
+    @staticmethod
+    def _reference(one: LinePhasors, axis: int) -> FloatArray:
+        """Position reference of an axis, (n,); zeros where there is none."""
+        experiment = one.given.experiment
+        if experiment.position_reference is None:
+            return np.zeros(experiment.samples)
+        reference = experiment.position_reference[:, axis]
+        return np.zeros(experiment.samples) if np.any(np.isnan(reference)) else reference
 
     def _parts(self, run_in: bool) -> tuple[TorquePart, ...]:
-        """The shares of the bends that torques show, of the axes that have any."""
-        unsure = bends_seen(self.recording)[1]
-        courses = [self._cut(one, self._bends(one), run_in, beyond=False) for one in self.lines]
-        spectra = [amplitudes(rows, self.recording.sample_period, bins) for rows, bins in courses]
-        return tuple(
-            TorquePart(axis, float(std), tuple(each[:, axis] for each in spectra))
-            for axis, std in enumerate(unsure)
-            if std > 0.0 and any(np.any(each[:, axis]) for each in spectra)
-        )
+        """What is not known of the sizes of the folds that show."""
+        parts = []
+        for fold, size in self.folds:
+            spectra = []
+            for one in self.lines:
+                course = fold.slope(self._reference(one, fold.axis), size)
+                rows, bins = self._cut(one, course[:, None], run_in, beyond=False)
+                spectra.append(amplitudes(rows, self.recording.sample_period, bins)[:, 0])
+            parts.append(TorquePart(fold.axis, fold.std, tuple(spectra), size - fold.size))
+        return tuple(parts)
+
+    def sized(self, data: RecordData, found: RefinedModel) -> "WholeRecords":
+        """Return the same with sizes of the folds as the fit to these data found them."""
+        more = data.part_sizes(found.model, found.delay_values)
+        sizes = [size + more for (_, size), more in zip(self.folds, more.tolist(), strict=True)]
+        return replace(self, sizes=tuple(sizes))
 
     def _cut(
         self, one: LinePhasors, signals: FloatArray, run_in: bool, beyond: bool
