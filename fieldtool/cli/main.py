@@ -48,6 +48,7 @@ from fieldtool.cli.screen import (
     show_parameters,
     show_result,
 )
+from fieldtool.cli.simulate import simulate
 from fieldtool.cli.stop_key import StopKey, may_move, somebody_there, stop_key
 from fieldtool.cli.tracing import TraceFile, TraceWanted, trace_path
 from fieldtool.errors import (
@@ -492,27 +493,13 @@ def export(
     console_of(False).print(f"{folder} written.")
 
 
-@app.command()
-def simulate(
-    machine: Machine,
-    interface: Annotated[str, typer.Option(help="python-can interface.")],
-    channel: Channel = None,
-    bitrate: Bitrate = None,
-) -> None:
-    """Serve the simulated machine's nodes in real time on a bus, until Ctrl-C."""
-    console = console_of(False)
-    with stop_key("Ending ...") as key:
-        profile = on_bus(machine, interface, channel, bitrate)
-        served = workflow.simulate(profile, key, console.print)
-    console.print(served)
-
-
 app.command()(scan)
 app.add_typer(profile_app, name="profile")
 app.command()(check)
 app.command("replay")(replay_command)
 app.command()(criticise)
 app.command()(report)
+app.command()(simulate)
 
 
 def _lengths(masses: Sequence[str]) -> dict[str, int]:

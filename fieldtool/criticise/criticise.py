@@ -34,7 +34,8 @@ from fieldtool.criticise.where.sentences import (
     relative_error,
     relative_noise,
 )
-from fieldtool.records.model import MachineModel
+from fieldtool.errors import NotEnoughDataError
+from fieldtool.records.model import Estimate, MachineModel
 from fieldtool.records.recording import Recording
 
 FloatArray = NDArray[np.float64]
@@ -90,8 +91,16 @@ def criticise(
     NotEnoughDataError
         If nothing can be compared, or the model is of other axes.
     """
-    prepared = prepare(recording, _bare(model, prior), contiguous)
-    found = search(prepared, without, advance, _accepted_base(prepared, model, prior))
+    prepared = prepare(recording, _settling(_bare(model, prior)), contiguous)
+    try:
+        with np.errstate(over="ignore", invalid="ignore"):
+            found = search(prepared, without, advance, _accepted_base(prepared, model, prior))
+    except np.linalg.LinAlgError as error:
+        raise NotEnoughDataError(
+            "the simulated machine runs away, so nothing can be compared: its model is no "
+            "machine that can stand still. Identify it with other numbers of masses (`fieldtool "
+            "identify FOLDER --masses AXIS=N`), then criticise again."
+        ) from error
     prepared = found.prepared
     before = _axis_errors(found, found.before)
     after = _axis_errors(found, found.after)
@@ -140,6 +149,27 @@ def _bare(model: MachineModel, prior: MachineModel | None) -> MachineModel:
     found = {frozenset(c.axes): c for c in model.couplings}
     couplings = tuple(found.get(frozenset(c.axes), c) for c in prior.couplings if c.value != 0.0)
     return replace(model, axes=tuple(axes), couplings=couplings, effects=())
+
+
+def _settling(model: MachineModel) -> MachineModel:
+    """Return the model without dampers and frictions below zero, from which hidden masses run away.
+
+    An identification gives such where a delay or a lag, which it does not know of, undoes damping.
+    """
+    axes = tuple(
+        replace(
+            axis,
+            dampers=tuple(_not_negative(d) for d in axis.dampers),
+            viscous_friction=_not_negative(axis.viscous_friction),
+            load_friction=_not_negative(axis.load_friction),
+        )
+        for axis in model.axes
+    )
+    return replace(model, axes=axes)
+
+
+def _not_negative(estimate: Estimate) -> Estimate:
+    return replace(estimate, value=max(estimate.value, 0.0))
 
 
 def _accepted_base(

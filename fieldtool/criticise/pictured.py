@@ -18,6 +18,7 @@ from fieldtool.criticise.evidence.spans import Role
 from fieldtool.criticise.pictures_file import Kind, Picture, Series
 from fieldtool.criticise.search.fit import Fitted
 from fieldtool.criticise.search.search import Found
+from fieldtool.criticise.simulate.motion import Motion
 from fieldtool.criticise.where.sentences import (
     LevelError,
     Parts,
@@ -175,7 +176,7 @@ def _by_lines(sides: Sides, axis: int) -> Picture | None:
     ]
     odd, even = rows[0][1] / 100, rows[0][2] / 100
     if max(odd, even) < NONLINEAR:
-        sentence = "almost nothing at frequencies that were not excited: the axis answers linearly"
+        sentence = f"below {100 * NONLINEAR:g} % of the torque at frequencies that were not excited"
     elif odd > SPREAD * even:
         sentence = (
             f"{100 * odd:.2g} % of the torque is at odd multiples that were not excited: something "
@@ -329,10 +330,20 @@ def _blocks(side: _Side, axis: int) -> Series:
     motions, errors = side.context.motions, side.context.errors
     clock = np.concatenate([m.clock for m in motions])
     error = np.concatenate([e[:, axis] for e in errors])
-    compared = np.flatnonzero(error)
+    counted = [m.counted[:, axis] * _compared(side.parts, m) for m in motions]
+    compared = np.flatnonzero(np.concatenate(counted))
     blocks = [b for b in np.array_split(compared, BLOCKS) if b.size]
     x = np.array([clock[b].mean() for b in blocks])
     return Series(side.label, x, np.array([np.sqrt(np.mean(error[b] ** 2)) for b in blocks]))
+
+
+def _compared(parts: Parts, motion: Motion) -> FloatArray:
+    """1 in the rows of an experiment that are compared, else 0."""
+    out = np.zeros(motion.rows)
+    for lines, _ in parts:
+        if lines.span.experiment == motion.experiment:
+            out[lines.span.start : lines.span.stop] = 1.0
+    return out
 
 
 def _by_axes(sides: Sides, axis: int) -> Picture | None:

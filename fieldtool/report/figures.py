@@ -90,7 +90,6 @@ def response_figure(
         Of the ratio.
     """
     i, j = place
-    name, other = model.names[i], model.names[j]
     data: list[Figure] = []
     grid = _grid(measured, band)
     curve = _size(model, grid, i, j)
@@ -132,10 +131,7 @@ def response_figure(
             }
         )
         largest = max(largest, float(size.max(initial=0.0)))
-    what = "its own torque" if i == j else f"torque of {other}"
     look = layout("frequency, Hz", unit, logarithmic=True, legend=place == (0, 0))
-    look["margin"] = {**look["margin"], "t": 54 if place == (0, 0) else 30}
-    look["annotations"] = [_heading(f"{name}: acceleration per {what}", legend=place == (0, 0))]
     smallest = max(float(curve[curve > 0].min(initial=largest)) / 3, largest * FAINTEST)
     look["yaxis"]["range"] = numbers(np.log10([smallest, 2.0 * largest]))
     _ticks(look["xaxis"], grid)
@@ -173,20 +169,6 @@ def _line(name: str, x: FloatArray, y: FloatArray, color: str, width: float) -> 
         "x": numbers(x),
         "y": numbers(y),
         "line": {"color": color, "width": width},
-    }
-
-
-def _heading(text: str, *, legend: bool = False) -> Figure:
-    return {
-        "text": f"<b>{escape(text)}</b>",
-        "x": 0,
-        "y": 1.0,
-        "yshift": 40 if legend else 18,
-        "xref": "paper",
-        "yref": "paper",
-        "xanchor": "left",
-        "yanchor": "middle",
-        "showarrow": False,
     }
 
 

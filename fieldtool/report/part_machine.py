@@ -63,8 +63,9 @@ def responses(material: Material) -> Section | None:
             response_figure(
                 measured, model, material.prior, material.band, (i, j), unit(model, i, j, material)
             ),
-            "",
-            310,
+            f"{model.names[i]}: acceleration per "
+            + ("its own torque" if i == j else f"torque of {model.names[j]}"),
+            300,
         )
         for i, j in places
     )

@@ -60,4 +60,6 @@ def listed(words: Sequence[str]) -> str:
 
 def percent(share: float | None) -> str:
     """Return a share as a percentage; words where it is not known."""
-    return "not known" if share is None else f"{100 * share:.2g} %"
+    if share is None:
+        return "not known"
+    return f"{100 * share:.0f} %" if abs(share) >= 0.1 else f"{100 * share:.2g} %"

@@ -19,6 +19,7 @@ from fieldtool.workflow.session import (
     parameter_table,
 )
 from fieldtool.workflow.stages import draw, identify, measure, redesign, restore, run, write
+from fieldtool.workflow.twin import Twin, twin
 
 __all__ = [
     "CheckResult",
@@ -26,6 +27,7 @@ __all__ = [
     "Quiet",
     "Screen",
     "SessionResult",
+    "Twin",
     "check",
     "compare",
     "criticise",
@@ -44,5 +46,6 @@ __all__ = [
     "run",
     "simulate",
     "truth_model",
+    "twin",
     "write",
 ]

@@ -212,7 +212,7 @@ def test_pictures_survive_their_file_and_speak_of_the_cause(session):
     # A delay is linear, of the axis' own motion, and leaves nothing between the lines.
     assert "own motion" in by["b", "follows"].sentence
     assert "own motion" in by["b", "axes"].sentence
-    assert "answers linearly" in by["b", "lines"].sentence
+    assert "below 1 % of the torque" in by["b", "lines"].sentence
     assert "one size" in by["b", "amplitude"].sentence
     assert "no drift" in by["b", "session"].sentence
     before, after = by["b", "session"].series
