@@ -26,6 +26,9 @@
 from collections.abc import Collection, Mapping
 from pathlib import Path
 
+LONGEST = 1000
+"""Characters of a message about a profile."""
+
 
 class DrivesError(Exception):
     """Root; the message is one sentence for a person."""
@@ -36,7 +39,10 @@ class ProfileError(DrivesError):
 
     def __init__(self, path: Path | str, message: str, line: int | None = None) -> None:
         self.path, self.line = Path(path), line
-        super().__init__(f"{path}:{line}: {message}" if line else f"{path}: {message}")
+        shown = "".join(c if c.isprintable() else " " for c in message)  # the file's words, perhaps
+        if len(shown) > LONGEST:
+            shown = f"{shown[: LONGEST // 2]} ... {shown[-LONGEST // 2 :]}"
+        super().__init__(f"{path}:{line}: {shown}" if line else f"{path}: {shown}")
 
 
 class BusError(DrivesError):

@@ -16,6 +16,9 @@
 
 from pathlib import Path
 
+LONGEST = 1000
+"""Characters of a message about a file."""
+
 
 class FieldtoolError(Exception):
     """Root of all that the tool itself refuses; its message is one sentence for a person."""
@@ -30,7 +33,15 @@ class FileFormatError(FieldtoolError):
     def __init__(self, path: Path | str, message: str, line: int | None = None) -> None:
         self.path, self.line = Path(path), line
         where = f"{path}:{line}" if line is not None else f"{path}"
-        super().__init__(f"{where}: {message}")
+        super().__init__(f"{where}: {_presentable(message)}")
+
+
+def _presentable(message: str) -> str:
+    """Return what a file's own words can not spoil: no control characters, no pages of text."""
+    shown = "".join(c if c.isprintable() else " " for c in message)
+    return (
+        shown if len(shown) <= LONGEST else f"{shown[: LONGEST // 2]} ... {shown[-LONGEST // 2 :]}"
+    )
 
 
 class OutputError(FieldtoolError):

@@ -72,6 +72,8 @@ def _find(kind: Literal["drives", "machines"], name_or_path: str | Path) -> Path
     )
 
 
+LONGEST_NUMBER = 1000
+"""Bits of a whole number that is shown; Python refuses to write very long ones out."""
 P = TypeVar("P", DriveProfile, MachineProfile)
 
 
@@ -126,5 +128,7 @@ def _sentence(location: tuple[str | int, ...], message: str, error: Mapping[str,
     if kind == "extra_forbidden":
         return f"{where} is not a known key. Check its spelling or take it out."
     shown = error.get("input")
+    if isinstance(shown, int) and shown.bit_length() > LONGEST_NUMBER:
+        shown = f"of {shown.bit_length()} bits"
     value = f" (value {shown!r})" if isinstance(shown, str | int | float | bool) else ""
     return f"{where}: {message[0].lower()}{message[1:]}{value}."

@@ -7,6 +7,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Literal
 
+from drives.errors import ProfileError
 from drives.sim.dictionary import Key, Value
 from drives.sim.effects import (
     AsymmetricFriction,
@@ -216,10 +217,17 @@ def simulated_machine(profile: "MachineProfile") -> SimulatedMachine:
 
     Raises
     ------
-    ValueError
-        If the profile has no ``simulation`` section, not one entry in it for each axis, or a
-        linear axis without ``feed``.
+    ProfileError
+        If the profile has no ``simulation`` section, not one entry in it for each axis, a linear
+        axis without ``feed``, or describes nothing that can be.
     """
+    try:
+        return _described(profile)
+    except (ValueError, ArithmeticError) as error:
+        raise ProfileError(profile.path, f"simulation: {error}.") from error
+
+
+def _described(profile: "MachineProfile") -> SimulatedMachine:
     simulation = profile.simulation
     if simulation is None:
         raise ValueError(

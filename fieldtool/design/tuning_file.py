@@ -1,18 +1,33 @@
 """``tuning.yaml``: designed parameters and why."""
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-import yaml
+from pydantic import Field
 
 from fieldtool.design.tuning import AxisTuning, Tuning
 from fieldtool.errors import FileFormatError
+from fieldtool.records.yaml_file import Number, StrictModel, read_checked
+
+FORMAT = "fieldtool-tuning/1"
+
+
+class _Axis(StrictModel):
+    axis: str = Field(min_length=1)
+    parameters: dict[str, Number]
+    sensitivity_peak: Number = Field(gt=0)
+    reason: str
+
+
+class _TuningFile(StrictModel):
+    format: Literal["fieldtool-tuning/1"]
+    axes: list[_Axis] = Field(min_length=1)
 
 
 def tuning_as_dict(tuning: Tuning) -> dict[str, Any]:
     """Return plain values in the form of ``tuning.yaml``."""
     return {
-        "format": "fieldtool-tuning/1",
+        "format": FORMAT,
         "axes": [
             {
                 "axis": axis.axis,
@@ -31,24 +46,14 @@ def read_tuning(path: Path) -> Tuning:
     Raises
     ------
     FileFormatError
-        If it is missing or not a tuning.
+        With file and line: it is missing, too large, not YAML, no tuning, has a value that is no
+        finite number, or an axis twice.
     """
-    try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))
-        if data.get("format") != "fieldtool-tuning/1":
-            raise FileFormatError(path, "format must be fieldtool-tuning/1", 1)
-        return Tuning(
-            tuple(
-                AxisTuning(
-                    str(axis["axis"]),
-                    {str(k): float(v) for k, v in axis["parameters"].items()},
-                    float(axis["sensitivity_peak"]),
-                    str(axis["reason"]),
-                )
-                for axis in data["axes"]
-            )
-        )
-    except (OSError, yaml.YAMLError, AttributeError, KeyError, TypeError, ValueError) as error:
-        raise FileFormatError(
-            path, f"is no tuning ({error}); run `fieldtool design` first"
-        ) from None
+    if not path.is_file():
+        raise FileFormatError(path, "is not there; run `fieldtool design` first.")
+    checked, _ = read_checked(path, _TuningFile)
+    names = [axis.axis for axis in checked.axes]
+    doubled = next((name for name in names if names.count(name) > 1), None)
+    if doubled is not None:
+        raise FileFormatError(path, f"has parameters for the axis {doubled!r} twice.")
+    return Tuning(tuple(AxisTuning(**axis.model_dump()) for axis in checked.axes))

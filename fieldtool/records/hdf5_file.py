@@ -13,6 +13,8 @@ from fieldtool.errors import FileFormatError
 from fieldtool.records.files import check_size, write_atomic
 
 MAX_BYTES = 16 * 1024**3
+DAMAGED = (OSError, RuntimeError, KeyError, TypeError, OverflowError, UnicodeError, MemoryError)
+"""What h5py raises where a file's inner structure is not whole."""
 MAX_VALUES = 500_000_000
 """Most values in one dataset that are read: 4 GB of float64."""
 
@@ -137,8 +139,11 @@ def opened(path: Path | str, file_format: str) -> Iterator[Reader]:
             path, f"is not a readable HDF5 file, expected {file_format}."
         ) from error
     with file:
-        found = file.attrs.get("format")
-        if found != file_format:
+        try:
+            found = file.attrs.get("format")
+        except DAMAGED as error:
+            raise FileFormatError(path, f"is damaged ({error}).") from error
+        if not isinstance(found, str) or found != file_format:
             raise FileFormatError(
                 path,
                 f"has the format {found!r}, expected '{file_format}': it is of another "

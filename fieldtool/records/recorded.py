@@ -30,6 +30,8 @@ EXPERIMENT_KINDS: tuple[ExperimentKind, ...] = ("multisine", "stepped_sine", "mo
 COLUMNS = ("position_reference", "torque_reference", "position", "torque", "velocity", "statusword")
 """The signals of one axis, in the order in which files have them."""
 
+LARGEST = 1e12
+"""Of any position, velocity or torque, SI."""
 STEP_TOLERANCE = 0.01
 """Largest deviation of one time step, as a share of the sample period."""
 MEAN_TOLERANCE = 0.001
@@ -231,6 +233,12 @@ class Experiment:
             if np.any(bad):
                 row, column = np.argwhere(bad)[0]
                 return f"{name} of axis number {column} in row {row} is no finite number"
+            if np.any(np.abs(values) > LARGEST):
+                row, column = np.argwhere(np.abs(values) > LARGEST)[0]
+                return (
+                    f"{name} of axis number {column} in row {row} is {values[row, column]:.3g}, no "
+                    f"machine has more than {LARGEST:g}: correct the unit or the column"
+                )
         if self.statusword is not None and self.statusword.shape != shape:
             return f"statusword must have the shape {shape}, got {self.statusword.shape}"
         for name, values in self.extra.items():
@@ -344,7 +352,8 @@ def grid_fault(time: FloatArray, sample_period: float) -> GridFault | None:
     """
     if time.size < 2:
         return None
-    steps = np.diff(time) / sample_period
+    with np.errstate(over="ignore"):  # then it is infinite, which is no step either
+        steps = np.diff(time) / sample_period
     mean = float(np.median(steps))
     if abs(mean - 1) > STEP_TOLERANCE:
         return GridFault(
@@ -370,6 +379,8 @@ def _step_fault(step: float, sample_period: float) -> str:
     where = (
         f"the time step is {step * sample_period:.6g} s, the sample period {sample_period:.6g} s"
     )
+    if not np.isfinite(step):
+        return "the time column leaves every grid"
     if step <= 0.5:
         return f"{where}: a sample is doubled or out of order"
     if step >= 1.5:

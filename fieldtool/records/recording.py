@@ -15,7 +15,7 @@ import h5py
 import numpy as np
 
 from fieldtool.errors import FileFormatError
-from fieldtool.records.hdf5_file import MemoryFile, Reader, opened, put
+from fieldtool.records.hdf5_file import DAMAGED, MemoryFile, Reader, opened, put
 from fieldtool.records.recorded import (
     AxisInfo,
     Controller,
@@ -151,7 +151,7 @@ def load(path: Path | str) -> Recording:
             return _read_recording(reader)
         except ValueError as error:
             raise FileFormatError(path, f"does not hold a valid recording: {error}.") from error
-        except (OSError, RuntimeError) as error:
+        except DAMAGED as error:
             raise FileFormatError(path, f"is damaged ({error}).") from error
 
 

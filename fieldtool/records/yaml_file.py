@@ -16,6 +16,8 @@ from fieldtool.records.files import MEBIBYTE, read_text, write_atomic
 MAX_BYTES = 1 * MEBIBYTE
 MAX_DEPTH = 30
 """Of lists and mappings inside each other."""
+LONGEST_NUMBER = 1000
+"""Bits of a whole number that is shown; Python refuses to write very long ones out."""
 Path_ = tuple[str | int, ...]
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -105,8 +107,14 @@ def _sentence(error: Mapping[str, Any], where: Path_) -> str:
         return f"the key '{name}' is missing."
     if kind == "extra_forbidden":
         return f"the key '{name}' is not known: check its spelling."
-    shown = repr(given) if isinstance(given, str | int | float | bool | None) else "a structure"
-    return f"'{name}': {str(error['msg']).removeprefix('Value error, ')}; the file has {shown}."
+    message = str(error["msg"]).removeprefix("Value error, ")
+    return f"'{name}': {message}; the file has {_shown(given)}."
+
+
+def _shown(given: object) -> str:
+    if isinstance(given, int) and given.bit_length() > LONGEST_NUMBER:
+        return f"a number of {given.bit_length()} bits"
+    return repr(given) if isinstance(given, str | int | float | bool | None) else "a structure"
 
 
 def _parse(path: Path, text: str) -> tuple[Any, dict[Path_, int]]:

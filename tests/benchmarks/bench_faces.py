@@ -22,11 +22,12 @@ from tests.session.test_faces_session import numbers
 PAIRS = (
     ("reference", "reference"),
     ("epos4*", "epos4-dual-loop"),
+    ("epos4", "epos4-dual-loop"),
     ("novanta*", "epos4-dual-loop"),
     ("elmo-gold", "cia402*"),
     ("copley*", "nanotec*"),
 )
-WRITTEN = PAIRS[:3]
+WRITTEN = PAIRS[:4]
 GAINS = ("position_p", "velocity_p", "velocity_i")
 
 

@@ -4,6 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from drives.errors import ProfileError
 from drives.profile import load_machine
 from drives.sim.machine import SimulatedDrive, SimulatedMachine, simulated_machine
 from drives.sim.plant import ChainParameters
@@ -91,7 +92,7 @@ class TestDescription:
 
     def test_profile_without_simulation(self):
         profile = load_machine("paper-3x3").model_copy(update={"simulation": None})
-        with pytest.raises(ValueError, match="no `simulation` section"):
+        with pytest.raises(ProfileError, match="no `simulation` section"):
             simulated_machine(profile)
 
     def test_overridden_objects_win(self, rig_of):

@@ -1,6 +1,5 @@
 """Backups and journals that somebody changed, checksum included: refused in words, or harmless."""
 
-import copy
 from contextlib import suppress
 
 import pytest
@@ -24,21 +23,10 @@ from drives.parameters import (
     save_journal,
 )
 from drives.parameters.backup import checksum
+from tests.fuzzed import STRANGE, changed, places
 
 INFO = ObjectInfo(ObjectAddress(0x2010, 1), "REAL32", "gain")
 TEXT = ObjectInfo(ObjectAddress(0x2011), "VISIBLE_STRING", "label")
-STRANGE = st.one_of(
-    st.none(),
-    st.booleans(),
-    st.integers(-(2**70), 2**70),
-    st.floats(),
-    st.text(st.characters(codec="ascii", exclude_categories=["Cc"]), max_size=12),
-    st.sampled_from(["0x6040", "0x2010:01", "UNSIGNED32", "REAL64", "open", "stored", "../a", ""]),
-    st.lists(st.integers(), max_size=2),
-    st.dictionaries(st.text(max_size=3), st.integers(), max_size=2),
-    st.dates(),
-    st.binary(max_size=4),
-)
 
 
 @pytest.fixture(scope="module")
@@ -55,32 +43,6 @@ def files(tmp_path_factory):
     return folder, [
         yaml.safe_load((folder / name).read_text()) for name in ("write-journal.yaml", "b.yaml")
     ]
-
-
-def places(value, where=()):
-    """Yield every place inside plain values."""
-    yield where
-    if isinstance(value, dict | list):
-        items = value.items() if isinstance(value, dict) else enumerate(value)
-        for key, part in items:
-            yield from places(part, (*where, key))
-
-
-def changed(data, where, new, how):
-    """Return a copy with one place replaced, taken out, or doubled."""
-    data = copy.deepcopy(data)
-    inside = data
-    for key in where[:-1]:
-        inside = inside[key]
-    if how == "replace":
-        inside[where[-1]] = new
-    elif how == "remove":
-        del inside[where[-1]]
-    elif isinstance(inside, list):
-        inside.append(copy.deepcopy(inside[where[-1]]))
-    else:
-        inside[f"{where[-1]}-2"] = new
-    return data
 
 
 @settings(max_examples=400, deadline=None)

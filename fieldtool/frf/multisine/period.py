@@ -126,7 +126,8 @@ def _alike(references: FloatArray, N: int) -> tuple[NDArray[np.bool_], float]:
     size = np.std(references - straight, axis=0)
     limit = np.maximum(10 * _EXACT * size, 2.5 * np.array([quantum(one) for one in references.T]))
     same: NDArray[np.bool_] = np.all(np.abs(change - drift) <= limit, axis=1)
-    return same, float(np.max(np.median(np.abs(change - drift), axis=0) / size))
+    moved = np.maximum(size, np.finfo(float).tiny)
+    return same, float(np.max(np.median(np.abs(change - drift), axis=0) / moved))
 
 
 def quantum(values: FloatArray) -> float:
