@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from scipy.linalg import eigh
 
 from fieldtool.frf.held_targets import LINEAR_TARGETS, folded_phasors, folds
 from fieldtool.frf.multisine.matrix import joint_response
@@ -15,10 +16,11 @@ from fieldtool.identify.likelihood.parameters import (
 )
 from fieldtool.identify.likelihood.record_data import RecordData, Spectrum, spectrum_of
 from fieldtool.identify.likelihood.refine import RefinedModel, machine_response, refine
+from fieldtool.identify.modes.scan import noise_limit
 from fieldtool.identify.multisine.dry_friction import VELOCITY_BAND, signs_of_velocity
 from fieldtool.identify.multisine.whole_records import WholeRecords
 from fieldtool.records.closed_loop import AxisLoop, Biquad, ClosedLoop
-from fieldtool.records.model import MachineModel
+from fieldtool.records.model import Estimate, MachineModel
 from fieldtool.records.recorded import AxisInfo, Controller, Experiment, Recording
 
 STEP, FINE = 0.002, 16
@@ -260,3 +262,29 @@ def test_a_current_loops_lag_biases_no_mass(random_model, fresh_rng, told):
         pairs = zip(found.axes, model.axes, strict=True)
         wrong.append(max(abs(a.total_mass / b.total_mass - 1.0) for a, b in pairs))
     assert wrong[0] < 0.7 * wrong[1]
+
+
+def test_a_small_mode_shows_in_what_a_machine_without_it_leaves(random_model, fresh_rng):
+    plain = random_model(fresh_rng, (2, 1), friction=True)
+    plain = replace(plain, couplings=())
+    axis, hertz = plain.axes[0], fresh_rng.uniform(9.0, 14.0)
+    small = 0.03 * axis.masses[1].value
+    spring = small * (2 * np.pi * hertz) ** 2
+    longer = replace(
+        axis,
+        masses=(*axis.masses, Estimate(small)),
+        springs=(*axis.springs, Estimate(spring)),
+        dampers=(*axis.dampers, Estimate(0.02 * np.sqrt(small * spring))),
+    )
+    whole = replace(plain, axes=(longer, plain.axes[1]))
+    recording = with_noise(shaken(fresh_rng, whole).recording, fresh_rng)
+    omega = np.sqrt(eigh(whole.stiffness_matrix, whole.mass_matrix, eigvals_only=True)[2:])
+    place = float(omega[np.argmin(np.abs(omega - 2 * np.pi * hertz))])
+    gains = []
+    for model in (plain, whole):
+        data = data_of(recording, whole)
+        found = refine(model, data, fit_friction=True, fit_load_friction=True, fit_delay=True)
+        parameters = [p for p in machine_parameters(model, data.omega) if p.name in found.names]
+        gains.append(data.gain_of_mode(found.model, found.delay_values, parameters, place, 0.01))
+    noise = noise_limit(20, 2, 1e-6)
+    assert gains[1] < noise < 3 * noise < gains[0]

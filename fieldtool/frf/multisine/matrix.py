@@ -61,6 +61,9 @@ class JointResult:
     """Of each experiment, transients and folded images taken off."""
     distortion: tuple[AxisDistortion, ...]
     """Per axis and amplitude level; empty where no line was left out for detection."""
+    transient: float
+    """Largest share of transients in a signal where it is so large that the covariance may be too
+    small, 0 otherwise."""
     notes: tuple[str, ...]
     """What a technician should know, one sentence each."""
 
@@ -113,11 +116,12 @@ def joint_response(
     distortion = joint_distortion(measured, mean.response)
     check_distortion(distortion)
     notes = (
-        *_notes(measured, left_out),
+        *_notes(left_out),
         *mean.notes,
         *(one.sentence for one in distortion if one.worth_saying),
     )
-    return JointResult(mean.response, mean.freedom, tuple(measured), distortion, notes)
+    transient = _transient(measured)
+    return JointResult(mean.response, mean.freedom, tuple(measured), distortion, transient, notes)
 
 
 def _chosen(recording: Recording) -> list[Experiment]:
@@ -128,23 +132,21 @@ def _chosen(recording: Recording) -> list[Experiment]:
     ]
 
 
-def _notes(measured: Sequence[LinePhasors], left_out: int) -> list[str]:
-    notes = []
+def _transient(measured: Sequence[LinePhasors]) -> float:
     largest = max(one.transient for one in measured)
     few = min(one.given.periods for one in measured) < _ENOUGH
     allowed = _TOO_MUCH_OF_FEW if few else _TOO_MUCH
-    if largest > allowed and not any(_drifts(one.given.experiment) for one in measured):
-        bands = "may be too narrow" if few else "are wider for it"
-        notes.append(
-            f"Transients of up to {100 * largest:.0f} % of the signals were taken out of the responses, "
-            f"whose bands {bands}. More time (--time) would lessen them."
-        )
-    if left_out:
-        notes.append(
-            f"{left_out} excited lines were left out because the torques of the experiments do not "
-            "stand out of the noise in every direction, or too few experiments excite them."
-        )
-    return notes
+    drifts = any(_drifts(one.given.experiment) for one in measured)
+    return largest if largest > allowed and not drifts else 0.0
+
+
+def _notes(left_out: int) -> list[str]:
+    if not left_out:
+        return []
+    return [
+        f"{left_out} excited lines were left out because the torques of the experiments do not "
+        "stand out of the noise in every direction, or too few experiments excite them."
+    ]
 
 
 def _drifts(experiment: Experiment) -> bool:

@@ -1,6 +1,7 @@
 """What may be wrong with a chosen number of masses, and why there may be none, in words."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from math import pi, sqrt
 
 import numpy as np
@@ -15,7 +16,17 @@ SUNK = 3.0
 """Standard errors below which a mode that is left out is noise, and not mentioned."""
 
 
-def mode_doubts(search: ModeSearch, best: Trial) -> list[str]:
+@dataclass(frozen=True)
+class ModeDoubt:
+    """A mode that may be missing in the model, or may be none."""
+
+    omega: float
+    """rad/s."""
+    in_model: bool
+    sentence: str
+
+
+def mode_doubts(search: ModeSearch, best: Trial) -> list[ModeDoubt]:
     """Modes that hardly rise out of the noise, are left out, or may be missing."""
     if max(best.lengths) == 1 and best.excess < FAR:
         return []  # what is left is noise and errors of the method, which free modes follow
@@ -26,20 +37,22 @@ def mode_doubts(search: ModeSearch, best: Trial) -> list[str]:
         if left_out and seen < SUNK:
             continue
         if seen < SEEN or left_out:
-            doubts.append(
+            sentence = (
                 f"the mode at {w / (2 * pi):.4g} Hz is in doubt: it stands "
                 f"{seen:.2g} standard errors out of the noise, {SEEN:.0f} are needed"
                 + ("; the model does without it" if left_out else "")
                 + "; excite more strongly or longer there"
             )
+            doubts.append(ModeDoubt(float(w), not left_out, sentence))
     if search.hint is not None and not np.any(
         np.abs(best.modal.omega - search.hint) < 0.05 * search.hint
     ):
-        doubts.append(
+        sentence = (
             f"the responses hint at a further mode near {search.hint / (2 * pi):.4g} Hz "
             f"({sqrt(search.hint_chi2):.2g} standard errors), which is not in the model; excite "
             "more strongly there, or look for what is not linear"
         )
+        doubts.append(ModeDoubt(search.hint, False, sentence))
     return doubts
 
 

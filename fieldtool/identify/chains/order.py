@@ -25,7 +25,7 @@ from dataclasses import dataclass
 
 from fieldtool.errors import IdentificationError
 from fieldtool.identify.chains.block_reduction import BlockReduced
-from fieldtool.identify.chains.doubts import mode_doubts, nothing_fits, other_doubts
+from fieldtool.identify.chains.doubts import ModeDoubt, mode_doubts, nothing_fits, other_doubts
 from fieldtool.identify.chains.trial import Trial, alike, at_errors_of_the_method, lengths_of
 from fieldtool.identify.chains.trying import simple_trials, trials_of
 from fieldtool.identify.likelihood.refine import RefinedModel
@@ -65,8 +65,10 @@ class OrderSelection:
     """All combinations that were tried, best first."""
     runner_up: Candidate | None
     """The best of the others; None if there was no other."""
-    doubts: tuple[str, ...]
-    """What may be wrong, a sentence each; empty where nothing speaks against the choice."""
+    mode_doubts: tuple[ModeDoubt, ...]
+    """Modes that hardly rise out of the noise, are left out, or may be missing."""
+    other_doubts: tuple[str, ...]
+    """Other lengths that explain the responses nearly as well, and a large misfit."""
     modal: ModalModel
     """The modes that the chosen machine rests on."""
     model: MachineModel
@@ -76,6 +78,11 @@ class OrderSelection:
     reduced: BlockReduced | None
     """What the modes alone say, with the tests of structure; None where only the refinement of
     clipped values led to the machine."""
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """What may be wrong, a sentence each; empty where nothing speaks against the choice."""
+        return (*(one.sentence for one in self.mode_doubts), *self.other_doubts)
 
 
 def select_order(
@@ -181,7 +188,8 @@ def _selection(
         dict(zip(data.names, best.lengths, strict=True)),
         evidence,
         runner_up,
-        (*mode_doubts(search, best), *other_doubts(data, best, trials, decided)),
+        tuple(mode_doubts(search, best)),
+        tuple(other_doubts(data, best, trials, decided)),
         best.modal,
         best.refined.model,
         best.refined,

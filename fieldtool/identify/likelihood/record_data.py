@@ -113,6 +113,9 @@ class RecordData:
     """Of each: (F, M, M), E[e e^H] of the equation error, rad2 or m2."""
     parts: tuple[TorquePart, ...] = ()
     """What is in the torques besides, its most likely size taken off already."""
+    spread: tuple[FloatArray | None, ...] | None = None
+    """Of each stretch: (2 n,), standard deviations of what positions, then velocities, of all masses
+    differ by between the ends; 0 where they do not.  None: nothing is known of that."""
 
     @cached_property
     def omega(self) -> FloatArray:
@@ -126,12 +129,15 @@ class RecordData:
 
     def eliminated(self, model: MachineModel) -> int:
         """Return how many of the numbers the states at the ends and sizes of torque parts use up."""
-        return 2 * int(model.mass_matrix.shape[0]) * len(self.spectra) + len(self.parts)
+        states = 2 * int(model.mass_matrix.shape[0])
+        free = [states if one is None else np.count_nonzero(one) for one in self._spread]
+        return int(sum(free)) + len(self.parts)
 
     def residuals(self, model: MachineModel, delays: FloatArray, _floor: float = 0.0) -> FloatArray:
         """Equation errors in standard errors, states and sizes of torque parts eliminated.
 
-        After those of all stretches comes one of each part: its size in standard errors.
+        After those of each stretch come its states in standard deviations, where something is known of
+        them; after those of all stretches comes one of each part: its size in standard errors.
         """
         wide = self._with_parts(model, delays)
         span = self._span(model, delays)
@@ -164,6 +170,33 @@ class RecordData:
         left: FloatArray = wide - span @ (span.T @ wide)
         return left
 
+    def gain_of_mode(
+        self,
+        model: MachineModel,
+        delays: FloatArray,
+        parameters: Sequence[Parameter],
+        omega: float,
+        zeta: float,
+    ) -> float:
+        """By how much chi2 would fall with one more small mode, states and parameters following.
+
+        A score test: residuals projected on the answers of a mode with this pole, whose residues are
+        any symmetric matrix; chi2-distributed with M (M + 1) / 2 degrees of freedom without a mode.
+        Its own free motion is not reckoned with.
+        """
+        systems = self.systems(model, delays)
+        told = np.concatenate([one.mode(omega, zeta) for one in systems])
+        answers = np.vstack([told, np.zeros((len(self.parts), told.shape[1]))])
+        followed = np.linalg.qr(self.jacobian(model, delays, parameters))[0]
+        for span in (self._span(model, delays), followed):
+            answers = answers - span @ (span.T @ answers)
+        scale = np.linalg.norm(answers, axis=0)
+        basis, size, _ = np.linalg.svd(
+            answers / np.where(scale > 0, scale, 1.0), full_matrices=False
+        )
+        known = basis[:, size > ROUNDING * size[0]]
+        return float(np.sum((known.T @ self.residuals(model, delays)) ** 2))
+
     def _columns(self, model: MachineModel, delays: FloatArray) -> FloatArray:
         """Derivatives of all residuals by the sizes of the torque parts, (R + P, P)."""
         systems = self.systems(model, delays)
@@ -177,7 +210,8 @@ class RecordData:
     def _span(self, model: MachineModel, delays: FloatArray) -> FloatArray:
         """What sizes of torque parts can explain, an orthonormal basis, (R + P, P)."""
         if not self.parts:
-            return np.zeros((sum(2 * one.position.size for one in self.spectra), 0))
+            rows = sum(one.residuals.size for one in self.systems(model, delays))
+            return np.zeros((rows, 0))
         return np.asarray(np.linalg.qr(self._columns(model, delays))[0], dtype=np.float64)
 
     def systems(self, model: MachineModel, delays: FloatArray) -> "list[RecordSystem]":
@@ -189,11 +223,22 @@ class RecordData:
             self._kept.clear()
             self._kept[asked] = [
                 RecordSystem(
-                    one, model, compliance[np.searchsorted(self.omega, one.omega)], delays, white
+                    one,
+                    model,
+                    compliance[np.searchsorted(self.omega, one.omega)],
+                    delays,
+                    white,
+                    spread,
                 )
-                for one, white in zip(self.spectra, self._whitening, strict=True)
+                for one, white, spread in zip(
+                    self.spectra, self._whitening, self._spread, strict=True
+                )
             ]
         return self._kept[asked]
+
+    @property
+    def _spread(self) -> tuple[FloatArray | None, ...]:
+        return self.spread or (None,) * len(self.spectra)
 
     @cached_property
     def _kept(self) -> "dict[tuple[bytes, ...], list[RecordSystem]]":
@@ -222,6 +267,7 @@ class RecordSystem:
         compliance: ComplexArray,
         delays: FloatArray,
         whiten: ComplexArray,
+        spread: FloatArray | None = None,
     ) -> None:
         self.one, self.delays, self.whiten = one, delays, whiten
         self._motors = model.first_masses
@@ -233,11 +279,18 @@ class RecordSystem:
         jumped = at_motors @ (scale * mass)
         free = self.s[:, None, None] * jumped + at_motors @ (scale * damping)
         driven = _times(self.moved, self._acting())
-        error = _flat(_times(whiten, driven[:, self._motors] - one.position))
-        basis = _flat(whiten @ np.concatenate([free, jumped], axis=2))
-        self._span, states = _eliminated(basis, error)
-        self.residuals = self._left(error)
         n = mass.shape[0]
+        self._driven = driven
+        self._error = _flat(_times(whiten, driven[:, self._motors] - one.position))
+        self._basis = _flat(whiten @ np.concatenate([free, jumped], axis=2))
+        size = np.ones(2 * n) if spread is None else spread
+        self._known = 0 if spread is None else int(np.count_nonzero(spread))
+        basis = self._basis * size
+        if spread is not None:
+            basis = np.vstack([basis, np.eye(2 * n)[spread > 0]])
+        self._span, states = _eliminated(basis, self._with_known(self._error))
+        states = states * size
+        self.residuals = self._left(self._error)
         # What the masses' motion, velocity and acceleration are by the model, integrals as above.
         change, jump = (2 / one.duration) * states[:n], (2 / one.duration) * states[n:]
         force = (self.s[:, None] * change + jump) @ mass + change @ damping
@@ -248,15 +301,34 @@ class RecordSystem:
     @property
     def freedom(self) -> FloatArray:
         """Share of each bin that the states did not use up, (F,)."""
-        used = np.sum(self._span**2, axis=1).reshape(2, self.s.size, -1)
+        used = np.sum(self._told(self._span) ** 2, axis=1).reshape(2, self.s.size, -1)
         result: FloatArray = 1.0 - used.mean(axis=(0, 2))
         return result
 
     @property
     def white(self) -> ComplexArray:
         """Residuals as complex numbers, (F, M): both parts of variance 1."""
-        parts = self.residuals.reshape(2, self.s.size, -1)
+        parts = self._told(self.residuals).reshape(2, self.s.size, -1)
         result: ComplexArray = parts[0] + 1j * parts[1]
+        return result
+
+    def unrest(self) -> tuple[FloatArray, FloatArray]:
+        """What the stretch tells of its states, as independent numbers, (K,) each.
+
+        Returns
+        -------
+        found, told
+            Found are numbers of variance 1 + (told s)**2 where the states are independent, each with a
+            standard deviation of s times the motion of its mass, or the velocity.
+        """
+        turn, told, _ = np.linalg.svd(self._basis * self.motion, full_matrices=False)
+        return turn.T @ self._error, told
+
+    @property
+    def motion(self) -> FloatArray:
+        """Root mean squares of the motion of all masses, then of their velocities, (2 n,)."""
+        both = np.concatenate([self._driven, self.s[:, None] * self._driven], axis=1)
+        result: FloatArray = np.sqrt(np.sum(np.abs(both) ** 2, axis=0) / 2)
         return result
 
     def jacobian(self, parameters: Sequence[Parameter]) -> FloatArray:
@@ -269,6 +341,16 @@ class RecordSystem:
         turned = spectrum * np.exp(-self.s * self.delays[axis])
         answer = self.moved[:, self._motors, axis] * turned[:, None]
         return -self._left(_flat(_times(self.whiten, answer)))
+
+    def mode(self, omega: float, zeta: float) -> FloatArray:
+        """What a mode with this pole would add, for each residue between two motors, (R, pairs)."""
+        curve = 1.0 / (self.s**2 + 2 * zeta * omega * self.s + omega**2)
+        moved, M = curve[:, None] * self._acting(), self.delays.size
+        answers = np.zeros((self.s.size, M, M * (M + 1) // 2), dtype=np.complex128)
+        for k, (a, b) in enumerate(zip(*np.triu_indices(M), strict=True)):
+            answers[:, a, k] = moved[:, b]
+            answers[:, b, k] = moved[:, a]
+        return self._left(_flat(self.whiten @ answers))
 
     def _column(self, p: Parameter) -> ComplexArray:
         """Derivative of the motors' motion, (F, M): minus what is felt, through the compliance."""
@@ -301,14 +383,25 @@ class RecordSystem:
         return result
 
     def _left(self, rows: FloatArray) -> FloatArray:
-        """Take from rows (R,) or (R, P) what the states can explain."""
+        """Take from rows (R,) or (R, P) what the states can explain; add those of known states."""
+        rows = self._with_known(rows)
         left: FloatArray = rows - self._span @ (self._span.T @ rows)
         return left
+
+    def _with_known(self, rows: FloatArray) -> FloatArray:
+        """Rows and below them a zero for each state of which something is known."""
+        return np.concatenate([rows, np.zeros((self._known, *rows.shape[1:]))])
+
+    def _told(self, rows: FloatArray) -> FloatArray:
+        """Without the rows of known states."""
+        return rows[: rows.shape[0] - self._known]
 
 
 def _eliminated(basis: FloatArray, right: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return an orthonormal basis of the states' columns (R, S), and the most likely states (S,)."""
     scale = np.linalg.norm(basis, axis=0)
+    if not np.any(scale):
+        return np.zeros((basis.shape[0], 0)), np.zeros(scale.size)
     scale[scale == 0.0] = 1.0
     span, triangle, order = qr(basis / scale, mode="economic", pivoting=True, check_finite=False)
     size = np.abs(np.diag(triangle))

@@ -98,8 +98,6 @@ def scan_grid(data: ResponseMatrix) -> tuple[FloatArray, FloatArray]:
     return np.tile(omega, len(SCAN_DAMPINGS)), np.repeat(SCAN_DAMPINGS, omega.size)
 
 
-def noise_limit(data: ResponseMatrix, chance: float = SURE) -> float:
-    """Gain that noise reaches anywhere in the band with a given chance."""
-    axes = len(data.names)
-    tries = 2.0 * data.omega.size
-    return float(chi2_distribution.isf(chance / tries, axes * (axes + 1) // 2))
+def noise_limit(lines: int, axes: int, chance: float = SURE) -> float:
+    """Gain that noise reaches anywhere in a band of so many lines with a given chance."""
+    return float(chi2_distribution.isf(chance / (2.0 * lines), axes * (axes + 1) // 2))

@@ -404,7 +404,7 @@ def _hints(
         gain[np.abs(scan.omega - omega) < 2.0 * spacing] = 0.0
     for _ in range(3):
         best = int(np.argmax(gain))
-        if not gain[best] > noise_limit(data):
+        if not gain[best] > noise_limit(data.omega.size, len(data.names)):
             return
         yield float(scan.omega[best]), float(scan.zeta[best])
         gain[np.abs(scan.omega - scan.omega[best]) < 2.0 * spacing] = 0.0
@@ -424,5 +424,6 @@ def _strongest_hint(data: ResponseMatrix, modal: ModalModel) -> tuple[float | No
         return None, 0.0
     scan = scan_modes(data, modal, *scan_grid(data))
     best = int(np.argmax(scan.gain))
-    found = bool(scan.gain[best] > noise_limit(data, DOUBTFUL))
+    limit = noise_limit(data.omega.size, len(data.names), DOUBTFUL)
+    found = bool(scan.gain[best] > limit)
     return (float(scan.omega[best]) if found else None), float(scan.gain[best])

@@ -24,6 +24,7 @@ from fieldtool.identify.chains.modal_chain import reduce_modes
 from fieldtool.identify.chains.order import OrderSelection, select_order
 from fieldtool.identify.classic import without_friction, without_friction_seen
 from fieldtool.identify.likelihood.joint_data import frequencies_of, joint_spectra
+from fieldtool.identify.likelihood.record_data import RecordData
 from fieldtool.identify.likelihood.refine import RefinedModel, machine_response, refine
 from fieldtool.identify.likelihood.response_data import ResponseMatrix, matrix_of
 from fieldtool.identify.modes.fit import fit_modes
@@ -36,6 +37,7 @@ from fieldtool.identify.multisine.dry_friction import (
     without_dry_friction,
 )
 from fieldtool.identify.multisine.records import check_alive, moving_on, settled, with_periods
+from fieldtool.identify.multisine.second_look import still_in_doubt
 from fieldtool.identify.multisine.whole_records import WholeRecords
 from fieldtool.records.model import Estimate, Kind, MachineModel
 from fieldtool.records.recording import Experiment, Recording
@@ -131,8 +133,12 @@ def identify_joint(
         fit = _Fit([one.phasors(recording.names) for one in lines], recording, priors)
         first = _first_fit(_starts(start, modal, prior, kinds), data, priors)
         fitted, friction = fit.run(first)
-        fitted = _with_free_motion(fitted, WholeRecords.of(recording, lines, friction), priors)
+        fitted, whole = _with_free_motion(
+            fitted, WholeRecords.of(recording, lines, friction), priors
+        )
         _check_explained(fit.unexplained(fitted), friction)
+    notes += _mode_notes(order, fitted, whole, data.omega.size)
+    notes += _transient_note(measured, data, fitted)
     notes += [unknown.reason for unknown in fitted.unknown]
     notes += _friction_notes(friction, recording)
     notes += _misfit_note(fitted)
@@ -253,7 +259,7 @@ def _chosen_order(
             raise
         notes.append(f"{error} The chains are as long as in the prior model.")
         return None
-    notes += order.doubts
+    notes += order.other_doubts
     notes += _structure_notes(order.reduced)
     if order.runner_up is not None:
         notes.append(_runner_up(order, data.names))
@@ -396,13 +402,16 @@ class _Fit:
 
 def _with_free_motion(
     start: RefinedModel, records: WholeRecords, priors: Mapping[str, Estimate]
-) -> RefinedModel:
-    """Fit whole records, transients and all; the start's frictions that were not seen stay out."""
+) -> tuple[RefinedModel, RecordData | None]:
+    """Fit whole records, transients and all; the start's frictions that were not seen stay out.
+
+    Returns the fit and its data, or the start and None where records are too long.
+    """
     if records.too_long:
-        return start
+        return start, None
     axes = start.model.axes
     still = [f"{axis.name}.viscous_friction" for axis in axes if not axis.viscous_friction.value]
-    found = start
+    found, data = start, None
     for _ in range(WEIGHTINGS):
         data = records.data(found, run_in=not np.any(records.friction))
         found = refine(
@@ -416,7 +425,32 @@ def _with_free_motion(
             delays=found.delay_values.tolist(),
         )
         records = records.sized(data, found)
-    return found
+    return found, data
+
+
+def _mode_notes(
+    order: OrderSelection | None, fitted: RefinedModel, whole: RecordData | None, lines: int
+) -> list[str]:
+    """Say which modes are in doubt, by the responses and by the whole records."""
+    doubts = () if order is None else order.mode_doubts
+    return [
+        one.sentence for one in doubts if whole is None or still_in_doubt(one, fitted, whole, lines)
+    ]
+
+
+def _transient_note(measured: JointResult, data: ResponseMatrix, fitted: RefinedModel) -> list[str]:
+    """Say how far the model lies outside of the responses' bands, where transients may be why."""
+    if not measured.transient:
+        return []
+    left = data.residuals(machine_response(fitted.model, data.omega, fitted.delay_values))
+    outside = sqrt(float(left @ left) / left.size)
+    if outside <= UNEXPLAINED:
+        return []
+    return [
+        f"Transients of up to {100 * measured.transient:.0f} % of the signals were taken out of the "
+        f"responses, whose bands are too narrow for it: the model differs from them by {outside:.1f} "
+        "times their noise. More time (--time) would lessen them."
+    ]
 
 
 def _still_loads(model: MachineModel) -> MachineModel:

@@ -1,9 +1,12 @@
 """Whole records of multisines made ready for the fit that holds the machine's own free motion.
 
 What the equation error's noise is, the bins between the lines of the periods tell: what repeats is
-not there, and transients are explained by the machine.  Of the noise of positions and torques only the
-shape is taken as it came with the phasors (:mod:`fieldtool.frf.multisine.lines`); errors whitened with
-it are averaged over neighbouring bins.
+not there, and transients are explained by the machine.  Its shape over frequency is that of white noise
+of each position and each torque, as strong as explains these errors best; errors whitened with that are
+averaged over neighbouring bins, which makes up for noise that is not white.
+
+How far the states at both ends of a stretch may differ, the records tell too: by a share of the motion
+that is most likely (none where the machine had settled), the same in all experiments of one design.
 """
 
 from collections.abc import Sequence
@@ -11,6 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import nnls
 
 from fieldtool.frf.held_targets import Fold, folds
 from fieldtool.frf.multisine.lines import LinePhasors, same_level
@@ -31,10 +35,14 @@ from fieldtool.records.recording import Recording
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
-FREEDOM_AN_AXIS = 40.0
+FREEDOM_AN_AXIS = 60.0
 """Degrees of freedom of the noise's estimate, for each axis."""
 FEWEST_AN_AXIS = 4.0
 """Below so many the noise keeps its shape and gets one factor."""
+SHAPINGS = 12
+"""Of finding the strengths of white noise, each weighted with those before."""
+SHARES = np.concatenate([[0.0], np.geomspace(1e-6, 1.0, 61)])
+"""Of the motion, that states may differ by from end to end; from the last one on they are free."""
 SLOWEST = 0.5
 """Of the lowest excited line: slower motion says nothing of the machine, and much of what drifts."""
 SAME_NOISE = 2.0
@@ -95,14 +103,15 @@ class WholeRecords:
         told = RecordData(self.recording.names, tuple(between), rough)
         seen = told.systems(found.model, found.delay_values)
         covariance: dict[int, ComplexArray] = {}
-        for group in self._groups(seen):
-            noise = _Noise.of([(self.lines[k], seen[k]) for k in group])
+        groups = self._groups(seen)
+        for group in groups:
+            noise = _Noise.of([(self.lines[k], seen[k]) for k in group], found)
             for k in group:
-                white = whitening(self._rough(self.lines[k], wide[k], found))
-                covariance[k] = noise.coloured(white, wide[k].omega)
-        names = self.recording.names
+                shape = self._rough(self.lines[k], wide[k], found)
+                covariance[k] = noise.coloured(wide[k], shape, found)
         errors = tuple(covariance[k] for k in range(len(wide)))
-        return RecordData(names, tuple(wide), errors, self._parts(run_in))
+        data = RecordData(self.recording.names, tuple(wide), errors, self._parts(run_in))
+        return replace(data, spread=_spread(data.systems(found.model, found.delay_values), groups))
 
     def _spectrum(self, one: LinePhasors, *, run_in: bool, beyond: bool) -> Spectrum:
         """Spectrum up to the highest line, or as far beyond it as the noise is wanted."""
@@ -196,39 +205,54 @@ class WholeRecords:
 
 @dataclass(frozen=True, eq=False)
 class _Noise:
-    """What errors between the lines have more, or less, than rough noise: after whitening with it."""
+    """What errors between the lines show: white noise, and where it is not white."""
 
     omega: FloatArray
     """(B,), rad/s, of the bins between the lines."""
     products: ComplexArray
-    """(B + 1, M, M): sums of e e^H over all bins before."""
+    """(B + 1, M, M): sums of e e^H over all bins before, whitened with the shape."""
     counts: FloatArray
     """(B + 1,): sums of their degrees of freedom."""
+    strength: FloatArray | None
+    """(2 M,): E|n|^2 of torques, then positions, times s; None where too few bins tell it."""
 
     @classmethod
-    def of(cls, seen: "Sequence[tuple[LinePhasors, RecordSystem]]") -> "_Noise":
+    def of(
+        cls, seen: "Sequence[tuple[LinePhasors, RecordSystem]]", found: RefinedModel
+    ) -> "_Noise":
         """From experiments of one design."""
-        periods = seen[0][0].given.periods
-        omega = seen[0][1].one.omega
-        between = (np.arange(omega.size) + 1) % periods != 0
+        periods, one = seen[0][0].given.periods, seen[0][1].one
+        between = (np.arange(one.omega.size) + 1) % periods != 0
+        omega = one.omega[between]
         white = np.array([system.white[between] for _, system in seen])
-        products = np.einsum("ebi,ebj->bij", white, white.conj()) / 2.0
         freedom = np.sum([system.freedom[between] for _, system in seen], axis=0)
+        strength = None
+        if freedom.sum() >= FEWEST_AN_AXIS * 2 * white.shape[2]:
+            back = np.array([np.linalg.inv(system.whiten[between]) for _, system in seen])
+            errors = np.einsum("ebij,ebj->ebi", back, white)
+            shapes = _white_shapes(found, omega)
+            strength = _strengths(errors, freedom, shapes) * one.duration
+            turn = whitening(_mixed(shapes, strength / one.duration))
+            white = np.einsum("bij,ebj->ebi", turn, errors)
+        products = np.einsum("ebi,ebj->bij", white, white.conj()) / 2.0
         zero = np.zeros((1, *products.shape[1:]))
         return cls(
-            omega[between],
+            omega,
             np.concatenate([zero, np.cumsum(products, axis=0)]),
             np.concatenate([[0.0], np.cumsum(freedom)]),
+            strength,
         )
 
-    def coloured(self, white: ComplexArray, omega: FloatArray) -> ComplexArray:
-        """Return covariances (F, M, M) at frequencies where `white` whitens the rough ones.
+    def coloured(self, at: Spectrum, rough: ComplexArray, found: RefinedModel) -> ComplexArray:
+        """Return covariances (F, M, M) of a stretch; `rough` is the shape where none was found.
 
         The inverse of a covariance estimated with D degrees of freedom is D / (D - M) too large on
         average, which is put right.
         """
-        M = white.shape[1]
-        low, high = windows(self.omega, self.counts, omega, FREEDOM_AN_AXIS * M)
+        if self.strength is not None:
+            rough = _mixed(_white_shapes(found, at.omega), self.strength / at.duration)
+        M = rough.shape[1]
+        low, high = windows(self.omega, self.counts, at.omega, FREEDOM_AN_AXIS * M)
         freedom = self.counts[high] - self.counts[low]
         total = self.products[high] - self.products[low]
         if freedom.min() < FEWEST_AN_AXIS * M:
@@ -237,9 +261,62 @@ class _Noise:
             mean = total / np.maximum(freedom, 1e-9)[:, None, None]
         else:
             mean = total / (freedom - M)[:, None, None]
-        back = np.linalg.inv(white) * np.sqrt(2.0)
+        back = np.linalg.inv(whitening(rough)) * np.sqrt(2.0)
         covariance: ComplexArray = back @ mean @ back.conj().transpose(0, 2, 1)
         return (covariance + covariance.conj().transpose(0, 2, 1)) / 2
+
+
+def _white_shapes(found: RefinedModel, omega: FloatArray) -> ComplexArray:
+    """Columns of what noise of each torque, then of each position, leaves in the error, (F, M, 2 M)."""
+    response = machine_response(found.model, omega, found.delay_values)
+    unit = np.broadcast_to(np.eye(response.shape[1]), response.shape)
+    return np.concatenate([response, unit], axis=2)
+
+
+def _mixed(shapes: ComplexArray, strength: FloatArray) -> ComplexArray:
+    mixed: ComplexArray = (shapes * strength) @ shapes.conj().transpose(0, 2, 1)
+    return mixed
+
+
+def _strengths(errors: ComplexArray, freedom: FloatArray, shapes: ComplexArray) -> FloatArray:
+    """Most likely E|n|^2 of the noises (2 M,) behind errors (E, B, M): Fisher's scoring.
+
+    Not less than its own standard error, so that no noise is taken for none.
+    """
+    power = np.einsum("ebi,ebj->bij", errors, errors.conj())
+    mean = np.einsum("bii->i", power).real / freedom.sum()
+    gain = np.mean(np.abs(shapes) ** 2, axis=0)  # (M, 2 M): each alone could explain everything
+    strength: FloatArray = np.min(mean[:, None] / np.maximum(gain, 1e-300), axis=0)
+    strength = np.where(gain.max(axis=0) > 0, strength, 0.0)
+    for _ in range(SHAPINGS):
+        turn = whitening(_mixed(shapes, strength)) / np.sqrt(2.0)
+        white = turn @ shapes * np.sqrt(strength)
+        overlap = np.abs(white.conj().transpose(0, 2, 1) @ white) ** 2
+        matrix = np.einsum("b,bkl->kl", freedom, overlap)
+        seen = turn @ power @ turn.conj().transpose(0, 2, 1)
+        right = np.einsum("bik,bij,bjk->k", white.conj(), seen, white).real
+        lower = np.linalg.cholesky(matrix + 1e-9 * np.trace(matrix) * np.eye(strength.size))
+        share = nnls(lower.T, np.linalg.solve(lower, right))[0]
+        error = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+        strength = strength * np.maximum(share, error)
+    return strength
+
+
+def _spread(
+    systems: Sequence[RecordSystem], groups: Sequence[Sequence[int]]
+) -> tuple[FloatArray | None, ...]:
+    """How far states may differ from end to end, (2 n,) of each stretch; None where that is open."""
+    spread: dict[int, FloatArray | None] = {}
+    for group in groups:
+        each = [systems[k].unrest() for k in group]
+        found = np.concatenate([one[0] for one in each])
+        told = np.concatenate([one[1] for one in each])
+        variance = 1.0 + np.outer(SHARES, told) ** 2
+        unlikely = np.sum(np.log(variance) + found**2 / variance, axis=1)
+        share = float(SHARES[np.argmin(unlikely)])
+        for k in group:
+            spread[k] = None if share >= SHARES[-1] else share * systems[k].motion
+    return tuple(spread[k] for k in range(len(systems)))
 
 
 def _with_next(signals: FloatArray, period: int) -> FloatArray:
