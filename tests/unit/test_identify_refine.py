@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fieldtool.errors import NotEnoughDataError
+from fieldtool.errors import IdentificationError, NotEnoughDataError
 from fieldtool.identify.features import chain_features
 from fieldtool.identify.likelihood.parameters import (
     machine_parameters,
@@ -214,6 +214,10 @@ def test_wrong_names_and_too_little_data_are_refused(rng):
     few = ResponseMatrix(data.names, data.omega[:1], data.response[:1], data.std[:1])
     with pytest.raises(NotEnoughDataError, match="2 measured numbers can not give 4 parameters"):
         refine(truth, few)
+    pushed = (Estimate(-0.02), *truth.axes[0].masses[1:])
+    backwards = replace(truth, axes=(replace(truth.axes[0], masses=pushed),))
+    with pytest.raises(IdentificationError, match="can not begin: m has masses -0.02"):
+        refine(backwards, data)
 
 
 def test_features_are_those_of_one_axis(rng):

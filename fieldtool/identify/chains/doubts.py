@@ -87,7 +87,7 @@ def nothing_fits(
 ) -> IdentificationError:
     """Return the error of responses that no machine explains: how many modes, and what is closest."""
     modes = search.modal.omega.size
-    where = ", ".join(f"{w / (2 * pi):.4g}" for w in search.modal.omega)
+    where = ", ".join(f"{w / (2 * pi):.4g}" for w in sorted(np.abs(search.modal.omega)))
     found = f"the responses hold {modes} modes" + (f" (at {where} Hz)" if modes else "")
     if not trials or modes > most:
         return IdentificationError(

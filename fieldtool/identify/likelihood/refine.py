@@ -140,10 +140,19 @@ def refine(
     NotEnoughDataError
         If there are fewer measured numbers than parameters.
     IdentificationError
-        If the fit ends at a mass matrix that no machine can have.
+        If a mass or spring of the start is not positive, or the fit ends at a mass matrix that no
+        machine can have.
     """
     if data.names != start.names:
         raise ValueError(f"the data have axes {data.names}, the model has {start.names}")
+    for axis in start.axes:
+        if not all(0.0 < each.value < inf for each in (*axis.masses, *axis.springs)):
+            raise IdentificationError(
+                f"the fit can not begin: {axis.name} has masses "
+                f"{', '.join(f'{m.value:.3g}' for m in axis.masses)} and springs "
+                f"{', '.join(f'{s.value:.3g}' for s in axis.springs) or 'none'} to start from, which "
+                "must be positive; give a prior model, or the numbers of masses (--masses)"
+            )
     fitted = {
         "delay": fit_delay,
         "viscous_friction": fit_friction,
