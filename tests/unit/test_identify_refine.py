@@ -216,7 +216,7 @@ def test_wrong_names_and_too_little_data_are_refused(rng):
         refine(truth, few)
     pushed = (Estimate(-0.02), *truth.axes[0].masses[1:])
     backwards = replace(truth, axes=(replace(truth.axes[0], masses=pushed),))
-    with pytest.raises(IdentificationError, match="can not begin: m has masses -0.02"):
+    with pytest.raises(IdentificationError, match=r"can not begin: m has masses -0\.02"):
         refine(backwards, data)
 
 
