@@ -313,6 +313,7 @@ def _spread(
         told = np.concatenate([one[1] for one in each])
         variance = 1.0 + np.outer(SHARES, told) ** 2
         unlikely = np.sum(np.log(variance) + found**2 / variance, axis=1)
+        unlikely[1:] += np.log(found.size)  # none, unless the data clearly say otherwise
         share = float(SHARES[np.argmin(unlikely)])
         for k in group:
             spread[k] = None if share >= SHARES[-1] else share * systems[k].motion
