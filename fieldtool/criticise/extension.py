@@ -36,7 +36,7 @@ def extended_model(found: Found, names: Sequence[str]) -> MachineModel:
         if effect.name == "viscous_friction":
             model = _with_viscous(model, effect.axis, effect.location, numbers["coefficient"])
             continue
-        if effect.name == "coupling_inertia":
+        if effect.name == "coupling_inertia" and effect.location == "load":
             n = numbers["inertia"]
             pair = (names[effect.axis], names[effect.other or 0])
             added = Coupling(pair, n.value, n.std)

@@ -18,7 +18,16 @@ def test_correlated_blocks_do_not_make_it_sure(fresh_rng):
     for _ in range(600):
         gains = lfilter([1.0], [1.0, -0.5], rng.normal(size=120))
         called += chance(gains)[1] < 0.01
-    assert called <= 36  # 2.5 % are called at the 1 % level: 36 of 600 are 5.5 standard errors more
+    assert called <= 24  # 8 expected at the 1 % level, 5.7 standard errors
+
+
+def test_few_correlated_blocks_do_not_make_it_sure_either(fresh_rng):
+    rng = fresh_rng
+    called = 0
+    for _ in range(600):
+        gains = lfilter([1.0], [1.0, -0.5], rng.normal(size=80))[50:]
+        called += chance(gains)[1] < 0.01
+    assert called <= 26  # 8 expected for 30 blocks: 6 standard errors
 
 
 def test_a_steady_gain_is_seen(fresh_rng):

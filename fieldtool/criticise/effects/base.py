@@ -63,6 +63,11 @@ class Effect:
     """Simpler effects on the same axis that this one contains."""
 
     @property
+    def seen_by(self) -> tuple[str, ...]:
+        """Views of which one has to show it; none for what reaches the motor through springs."""
+        return () if self.location == "load" else self.shows
+
+    @property
     def key(self) -> tuple[str, int, str, int | None]:
         """What tells it from all others: name, axis, location, other axis."""
         return self.name, self.axis, self.location, self.other

@@ -10,7 +10,7 @@ import numpy as np
 from fieldtool.criticise.effects.base import Context, Effect, Parameter, Values
 from fieldtool.criticise.simulate.structure import Element, Law, Relaxation, Structure
 
-GAPS = (0.2, 1.0, 4.0)
+GAPS = (0.02, 0.2, 1.0, 4.0)
 """Start values of half the gap over the RMS of the elongation that rigid masses would ask for."""
 BRANCHES = 5
 """Maxwell branches that make damping nearly the same at all frequencies."""

@@ -174,11 +174,22 @@ def disturbance_candidates(context: Context) -> list[Effect]:
         for k in np.argsort(level)[::-1][:2]:
             if level[k] > STANDS_OUT:
                 f = _between_lines(longest.torque.shape[0], context, longest, axis, grid[inside][k])
-                number = Parameter(
-                    "frequency", "Hz", f, f - 1.5 * width, f + 1.5 * width, 0.1 * width
-                )
+                low, high = _off_harmonics(context, f, 1.5 * width)
+                if not low < f < high:
+                    continue
+                number = Parameter("frequency", "Hz", f, low, high, 0.1 * width)
                 out.append(PeriodicDisturbance(axis, (number,)))
     return out
+
+
+def _off_harmonics(context: Context, frequency: float, reach: float) -> tuple[float, float]:
+    """Bounds about a frequency that no harmonic of the excitation is near to."""
+    low, high = frequency - reach, frequency + reach
+    for fundamental, spacing in context.fundamentals:
+        below = fundamental * np.floor(frequency / fundamental)
+        low = max(low, below + OFF_HARMONICS * spacing)
+        high = min(high, below + fundamental - OFF_HARMONICS * spacing)
+    return low, high
 
 
 def _between_lines(rows: int, context: Context, longest: Motion, axis: int, peak: float) -> float:

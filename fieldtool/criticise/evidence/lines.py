@@ -9,14 +9,17 @@ periodic, and from a white level and the noise of the position where it is not.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import butter, sosfiltfilt
+from scipy.ndimage import median_filter
+from scipy.signal import butter, sosfilt_zi
 from scipy.signal.windows import tukey
 
 from fieldtool.criticise.evidence.spans import Span
 from fieldtool.criticise.simulate.inverse import dynamic_stiffness
+from fieldtool.criticise.simulate.kernels import both_ways
 from fieldtool.criticise.simulate.motion import Motion, white_noise
 from fieldtool.criticise.simulate.structure import Structure
 
@@ -63,12 +66,17 @@ class Lines:
     unknown: tuple[FloatArray, ...] = ()
     """Their courses, (n, M) each."""
 
+    @cached_property
+    def at_rest(self) -> FloatArray:
+        """States of the low-pass for a constant 1, (sections, 2)."""
+        return np.asarray(sosfilt_zi(self.filter))
+
     def raw(self, error: FloatArray) -> ComplexArray:
         """Return the spectrum of an error of the whole experiment (n, M) at the lines, (L, M).
 
         What is above the band is taken out before rows are left out, or these would fold it into it.
         """
-        filtered = sosfiltfilt(self.filter, error, axis=0)
+        filtered = both_ways(self.filter, self.at_rest, np.ascontiguousarray(error))
         rows = filtered[self.span.start : self.span.stop]
         spectrum = np.fft.rfft(rows * self.window, axis=0) / rows.shape[0]
         return np.asarray(spectrum[: self.weight.shape[0]])
@@ -188,15 +196,12 @@ def _orthonormal(columns: FloatArray) -> FloatArray:
 
 def _between_harmonics(lines: ComplexArray, periods: int) -> FloatArray:
     """Noise at each line from those around it that are no multiples of the period's, (L, M)."""
-    between = np.arange(lines.shape[0]) % periods != 0
-    power = np.abs(lines) ** 2
-    out = np.empty_like(power)
-    places = np.flatnonzero(between)
-    for k in range(lines.shape[0]):
-        near = np.searchsorted(places, k)
-        chosen = places[max(0, near - AROUND) : near + AROUND]
-        out[k] = np.median(power[chosen], axis=0) / np.log(2.0)
-    return out
+    numbers = np.arange(lines.shape[0])
+    between = numbers[numbers % periods != 0]
+    power = np.abs(lines[between]) ** 2
+    level = median_filter(power, size=(2 * AROUND + 1, 1), mode="nearest") / np.log(2.0)
+    near = np.clip(np.searchsorted(between, numbers), 0, between.size - 1)
+    return np.asarray(level[near])
 
 
 def _repeated(lines: ComplexArray, moved: FloatArray, periods: int) -> FloatArray:

@@ -73,7 +73,7 @@ def pruned(
 
 def unsigned(prepared: Prepared, hypothesis: Hypothesis, effect: Effect) -> str:
     """Say so where the error without an effect does not look as the effect must; else empty."""
-    if not effect.shows:
+    if not effect.seen_by:
         return ""
     place = place_of(hypothesis, effect)
     less = replace(
@@ -88,7 +88,7 @@ def unsigned(prepared: Prepared, hypothesis: Hypothesis, effect: Effect) -> str:
         for h in (less, hypothesis)
     ]
     explains = max(0.0, 1.0 - power[1] / max(power[0], 1e-300))
-    views = views_of(prepared.context(less), effect.axis, effect.shows)
+    views = views_of(prepared.context(less), effect.axis, effect.seen_by)
     best = max((v.share for v in views), default=0.0)
     if best < SHOWN * explains:
         return f"its signature is not there: the error does not show what {effect.name} must leave"

@@ -17,6 +17,8 @@ ENOUGH = 1e-4
 TRIES = 6
 """Dampings tried a step."""
 LARGEST_FACTOR = 3.0
+RENEWED = 0.6
+"""Of the gain that a step promised: with less, the machine's derivatives are found anew."""
 DERIVATIVE = 1e-3
 """Step of a derivative over the size of the number."""
 
@@ -131,19 +133,28 @@ def fit(
     r = simulator.residual(current, "fit")
     cost = float(r @ r)
     damping, jacobian = 1e-6, np.zeros((r.size, len(free)))
-    fresh = shared is None
+    machine = np.array([f.parameter is None for f in free])
+    own = shared is None
+    old = None
+    if shared is not None:
+        old = shared[:, [f.index for f in free if f.parameter is None]]
     for turn in range(steps):
-        jacobian = derivatives(simulator, current, free, r, None if fresh else shared)
+        fresh = old is None
+        jacobian = derivatives(simulator, current, free, r, old)
+        old = jacobian[:, machine]
         rows = np.vstack([jacobian, np.diag(known)])
         side = np.concatenate([r, known * (vector - origin) / scales])
         before = cost + float(np.sum((known * (vector - origin) / scales) ** 2))
         size = np.linalg.norm(rows, axis=0)
         size[size == 0.0] = 1.0
-        u, s, vt = np.linalg.svd(rows / size, full_matrices=False)
-        projected = u.T @ side
+        rows /= size
+        values, vectors = np.linalg.eigh(rows.T @ rows)
+        values = np.maximum(values, 0.0)
+        projected = vectors.T @ (rows.T @ side)
         better = False
         for _ in range(TRIES):
-            move = -(vt.T @ (s / (s**2 + damping) * projected)) / size
+            step = projected / (values + damping)
+            move = -(vectors @ step) / size
             tried = with_vector(current, free, _limited(free, vector, scales * move))
             if not tried.machine.physical(tried.base):
                 damping = max(10 * damping, 1e-6)
@@ -159,14 +170,29 @@ def fit(
         if not better:
             if fresh:
                 break
-            fresh, damping = True, 1e-6
+            old, damping = None, 1e-6
             continue
-        gained = (before - total) / max(before, 1e-300)
+        gained = before - total
+        promised = float(np.sum((values + 2 * damping) * step**2))
         current, vector, r, cost = tried, reached, r_tried, after
         damping = max(damping / 10, 1e-9)
-        if gained < ENOUGH and (fresh or turn >= 1):
+        if gained < ENOUGH * max(before, 1e-300) and (own or fresh or turn >= 1):
             break
+        if gained < RENEWED * promised:
+            old = None
     return _result(current, free, vector, scales, jacobian, known, cost)
+
+
+def strain(fitted: Fitted) -> float:
+    """Return by how much a fit asks for zeros of the torques that are not likely: squares, added up."""
+    hypothesis = fitted.hypothesis
+    return float(
+        sum(
+            ((value - v.value) / (v.scale * v.known)) ** 2
+            for v, value in zip(hypothesis.machine.variables, hypothesis.base, strict=True)
+            if v.name.endswith(".offset")
+        )
+    )
 
 
 def _limited(free: list[_Free], vector: FloatArray, move: FloatArray) -> FloatArray:
@@ -183,14 +209,17 @@ def derivatives(
     hypothesis: Hypothesis,
     free: list[_Free],
     r: FloatArray,
-    shared: FloatArray | None,
+    old: FloatArray | None,
 ) -> FloatArray:
-    """Return the change of the weighted errors per size of each free number, (rows, P)."""
+    """Return the change of the weighted errors per size of each free number, (rows, P).
+
+    Those of the machine's numbers are ``old`` where that is given, (rows, free ones of the machine).
+    """
     vector = vector_of(hypothesis, free)
-    columns = []
+    columns: list[FloatArray] = []
     for k, f in enumerate(free):
-        if f.parameter is None and shared is not None:
-            columns.append(shared[:, f.index])
+        if f.parameter is None and old is not None:
+            columns.append(old[:, len(columns)])
             continue
         step = DERIVATIVE * f.scale
         if f.parameter is not None and vector[k] + step > f.parameter.high:

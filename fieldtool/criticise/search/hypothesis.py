@@ -85,7 +85,7 @@ class Simulator:
     def __post_init__(self) -> None:
         self._kept: dict[bytes, FloatArray] = {}
         self._free_key = b""
-        self._free_courses: FloatArray = np.zeros((0, 0, 0))
+        self._free: tuple[HiddenSystem, FloatArray]
 
     def errors(self, hypothesis: Hypothesis) -> dict[str, FloatArray]:
         """Return the torque measured less simulated, (n, M), by experiment."""
@@ -153,25 +153,34 @@ class Simulator:
         needed = needed_torque(structure, motion)
         if not structure.hidden.size:
             return needed
-        courses = self._free_motions(structure, motion.step)[:, : motion.rows]
-        counted = motion.counted[::THINNED]
-        columns = (courses[:, ::THINNED] * counted).reshape(courses.shape[0], -1).T
-        side = ((motion.torque - needed)[::THINNED] * counted).ravel()
-        size = np.linalg.norm(columns, axis=0)
+        system, courses = self._free_motions(structure, motion.step)
+        some = slice(0, courses.shape[1] * THINNED, THINNED)
+        counted = motion.counted[some]
+        columns = (courses[:, : counted.shape[0]] * counted).reshape(courses.shape[0], -1)
+        side = ((motion.torque[some] - needed[some]) * counted).ravel()
+        size = np.linalg.norm(columns, axis=1)
         size[size == 0.0] = 1.0
-        solved = np.linalg.lstsq(columns / size, side, rcond=1e-8)[0] / size
-        return np.asarray(needed + np.tensordot(solved, courses, axes=1), dtype=np.float64)
+        columns /= size[:, None]
+        start = np.zeros((1, system.rates.shape[0]))
+        solved = np.linalg.lstsq(columns @ columns.T, columns @ side, rcond=1e-12)[0] / size
+        start[0, : solved.size] = solved
+        rows = min(motion.rows, courses.shape[1] * THINNED)
+        needed[:rows] += system.free_from(start, motion.step, rows)[0]
+        return needed
 
-    def _free_motions(self, structure: Structure, step: float) -> FloatArray:
+    def _free_motions(self, structure: Structure, step: float) -> tuple[HiddenSystem, FloatArray]:
+        """Return the hidden masses, and what each state of theirs rings on as, every third row."""
         key = b"".join(
             m.tobytes() for m in (structure.mass, structure.damping, structure.stiffness)
         )
         key += repr(structure.branches).encode()
         if key != self._free_key:
             rows = max(m.rows for m in self.motions.values())
+            system = HiddenSystem.of(structure)
+            thinned = -(-rows // THINNED)
             self._free_key = key
-            self._free_courses = HiddenSystem.of(structure).free_torques(step, rows)
-        return self._free_courses
+            self._free = system, system.free_torques(step * THINNED, thinned)
+        return self._free
 
 
 def _without_unknown(hypothesis: Hypothesis, lines: Lines, values: FloatArray) -> FloatArray:

@@ -113,19 +113,19 @@ def reweighted(prepared: Prepared, hypothesis: Hypothesis) -> Prepared:
                 errors[span.experiment],
                 prepared.spans.top,
                 system.structure,
-                _from(free.get(span.experiment, []), span.start),
+                _from(free.get(span.experiment, []), span.start, motion.rows),
             )
         )
     simulator = Simulator(prepared.motions, tuple(lines))
     return Prepared(prepared.recording, prepared.spans, prepared.motions, simulator, prepared.start)
 
 
-def _from(courses: list[FloatArray], start: int) -> list[FloatArray]:
+def _from(courses: list[FloatArray], start: int, rows: int) -> list[FloatArray]:
     """Free motions that begin at a row."""
     out = []
     for course in courses:
-        moved = np.zeros_like(course)
-        moved[start:] = course[: course.shape[0] - start]
+        moved = np.zeros((rows, course.shape[1]))
+        moved[start : start + course.shape[0]] = course[: rows - start]
         out.append(moved)
     return out
 

@@ -13,6 +13,8 @@ from fieldtool.criticise.search.hypothesis import Hypothesis, Simulator
 FloatArray = NDArray[np.float64]
 MOST_OF_IT = (0.0, 2.0)
 """Bounds of how much of a start value's torque the data may ask for."""
+SMALLEST_PART = 0.02
+"""Of a start value, that is left of it at least."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,4 +149,7 @@ def _solved(
         start |= dict(zip(linear, values.tolist(), strict=True))
     elif effect.name == "torque_scale":
         start[effect.parameters[0].name] = 1.0 + float(values[0])
+    elif effect.name == "backlash":
+        # A gap small against the motion takes a torque away that grows with it.
+        start["half_gap"] *= max(float(values[0]), SMALLEST_PART)
     return Screened(effect, start, gain)

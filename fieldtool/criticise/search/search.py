@@ -9,8 +9,15 @@ from numpy.typing import NDArray
 
 from fieldtool.criticise.effects import candidates
 from fieldtool.criticise.effects.base import Context, Effect
-from fieldtool.criticise.search.afterwards import Accepted, Reasons, place_of, pruned, tied
-from fieldtool.criticise.search.fit import Fitted, fit
+from fieldtool.criticise.search.afterwards import (
+    Accepted,
+    Reasons,
+    place_of,
+    pruned,
+    tied,
+    unsigned,
+)
+from fieldtool.criticise.search.fit import Fitted, fit, strain
 from fieldtool.criticise.search.hypothesis import Hypothesis, Simulator
 from fieldtool.criticise.search.judge import Parts, beyond_noise, difference, judged
 from fieldtool.criticise.search.prepare import Prepared, reweighted
@@ -29,6 +36,8 @@ SCREENING = 0.4
 MOST_TURNS = 6
 SETTLED = 1e-3
 """Change of a number of the machine over its size, from which fit and noise are found anew."""
+ELSEWHERE, ELSEWHERE_LOOSE = 0.01, 0.3
+"""Relative change of a mass, spring or coupling, and of a damper or friction, that bends a fit."""
 TRACE = 0.01
 """Share of the error that a candidate must be expected to explain to be fitted in full."""
 Advance = Callable[[str, float], None]
@@ -72,7 +81,7 @@ def search(
     advance("fit the machine without effects", 0.0)
     prepared, before = settled(prepared, prepared.start)
     starts = [before.hypothesis]
-    if accepted_base is not None:
+    if accepted_base is not None and _elsewhere(before.hypothesis, accepted_base):
         starts.append(replace(prepared.start, base=accepted_base))
     current, accepted = before, list[Accepted]()
     rejected: Reasons = {}
@@ -107,6 +116,17 @@ def search(
         tuple(sorted(accepted, key=lambda a: -a.tried.torque)),
         tuple(r for key, r in rejected.items() if key not in names),
     )
+
+
+def _elsewhere(found: Hypothesis, accepted: FloatArray) -> bool:
+    """Whether a fit is so far from the accepted machine that effects look different from there."""
+    variables = found.machine.variables
+    off = np.abs(found.base - accepted) / np.array([v.scale for v in variables])
+    firm = np.array([v.positive or v.name.endswith(".coupling") for v in variables])
+    loose = np.array(
+        [not f and not v.name.endswith(".offset") for f, v in zip(firm, variables, strict=True)]
+    )
+    return bool(np.any(off[firm] > ELSEWHERE) or np.any(off[loose] > ELSEWHERE_LOOSE))
 
 
 def settled(prepared: Prepared, start: Hypothesis) -> tuple[Prepared, Fitted]:
@@ -179,8 +199,14 @@ def _round(
         rejected[candidate.effect.key] = (candidate.effect, why)
         if not why:
             good.append(candidate)
-    if good:
-        return [_winner(simulator, good, rejected)], looked
+    signed = []
+    for candidate in good:
+        why = unsigned(prepared, candidate.fitted.hypothesis, candidate.effect)
+        rejected[candidate.effect.key] = (candidate.effect, why)
+        if not why:
+            signed.append(candidate)
+    if signed:
+        return [_winner(simulator, signed, rejected)], looked
     return _pair(prepared, context, current, accepted, at, chosen[:PAIRED], unseen), looked
 
 
@@ -234,8 +260,15 @@ def _winner(simulator: Simulator, tried: Sequence[Tried], rejected: Reasons) -> 
         contained = (
             other.effect.axis == best.effect.axis and other.effect.name in best.effect.replaces
         )
-        if contained and (
-            difference(simulator, other.fitted, best.fitted).t < ALIKE_T
+        alike = difference(simulator, other.fitted, best.fitted).t < ALIKE_T
+        if (
+            other.effect.name == "measurement_delay"
+            and other.effect.axis == best.effect.axis
+            and alike
+        ):
+            best = other
+        elif contained and (
+            (alike and strain(other.fitted) < strain(best.fitted) + ALIKE_T**2)
             or best.torque**2 - other.torque**2 < (RELATED * other.torque) ** 2
         ):
             why = f"does no better than {other.effect.name}"

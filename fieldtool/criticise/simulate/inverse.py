@@ -7,12 +7,13 @@ is what the model does not know, as a torque at each motor.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
-from fieldtool.criticise.simulate.kernels import march, march_bent
+from fieldtool.criticise.simulate.kernels import march, march_bent, ring
 from fieldtool.criticise.simulate.motion import Motion
 from fieldtool.criticise.simulate.structure import Structure
 
@@ -20,6 +21,10 @@ FloatArray = NDArray[np.float64]
 LARGEST_TURN = 0.25
 """Of the fastest hidden mode in one sub-step, rad, where elements are not linear."""
 MOST_SUBSTEPS = 32
+FADED = 1e-3
+"""Of its first size: a free motion counts as gone."""
+FEWEST_FREE = 100
+"""Rows of a free motion at least."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,36 +88,44 @@ class HiddenSystem:
         )
 
     def free_torques(self, step: float, rows: int) -> FloatArray:
-        """Return the motors' torques for each initial hidden state, motors at rest, (2 H, n, M)."""
-        H = self.structure.hidden.size
-        advance = self.held(step)[0]
-        none = np.zeros((rows, self.rates.shape[0]))
-        out = np.empty((2 * H, rows, self.structure.motors.size))
-        still = np.zeros((rows, self.inputs.shape[1]))
-        for k in range(2 * H):
-            start = np.zeros(self.rates.shape[0])
-            start[k] = 1.0
-            out[k] = self.torque(march(advance, none, start), still, None)
-        return out
+        """Return the motors' torques for each initial hidden state, motors at rest, (2 H, n, M).
 
-    def torque(self, z: FloatArray, u: FloatArray, g: FloatArray | None) -> FloatArray:
-        """Return the motors' torques, (n, M), for states (n, S), inputs (n, 3 M) and forces (n, N)."""
+        What has faded to :data:`FADED` of its size is left out, and n is no more than ``rows``.
+        """
+        starts = np.eye(self.rates.shape[0])[: 2 * self.structure.hidden.size]
+        return self.free_from(starts, step, self.audible(step, rows))
+
+    def free_from(self, starts: FloatArray, step: float, rows: int) -> FloatArray:
+        """Return the motors' torques for each initial state (F, S), motors at rest, (F, rows, M)."""
+        size = self.rates.shape[0]
+        advance = np.ascontiguousarray(expm(self.rates * step)) if size else np.zeros((0, 0))
+        return np.asarray(ring(advance, self.readout[0], starts, rows))
+
+    def audible(self, step: float, rows: int) -> int:
+        """Return the rows after which a free motion has faded, no more than ``rows``."""
+        slowest = -float(np.linalg.eigvals(self.rates).real.max(initial=-np.inf))
+        if slowest * rows * step > -np.log(FADED):
+            rows = min(rows, max(FEWEST_FREE, int(np.ceil(-np.log(FADED) / (slowest * step)))))
+        return rows
+
+    @cached_property
+    def readout(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """What turns states, inputs and forces into the motors' torques: (M, S), (M, 3 M), (M, N)."""
         s = self.structure
         hidden, motors = s.hidden, s.motors
         H, M = hidden.size, motors.size
         stiff, stiff_w = _with_branches(s)
-        rows = [s.mass[motors], s.damping[motors], stiff[motors]]
-        q, v, a = u[:, :M], u[:, M : 2 * M], u[:, 2 * M :]
-        out = a @ rows[0][:, motors].T + v @ rows[1][:, motors].T + q @ rows[2][:, motors].T
-        if H:
-            moved = z @ self.rates[H : 2 * H].T + u @ self.inputs[H : 2 * H].T
-            if g is not None:
-                moved = moved + g[:, hidden] @ self.pushed[H : 2 * H].T
-            out += moved @ rows[0][:, hidden].T + z[:, H : 2 * H] @ rows[1][:, hidden].T
-            out += z[:, :H] @ rows[2][:, hidden].T + z[:, 2 * H :] @ stiff_w[motors].T
-        if g is not None:
-            out = out - g[:, motors]
-        return np.asarray(out, dtype=np.float64)
+        inertia = s.mass[np.ix_(motors, hidden)]
+        of_state = inertia @ self.rates[H : 2 * H]
+        of_state[:, :H] += stiff[np.ix_(motors, hidden)]
+        of_state[:, H : 2 * H] += s.damping[np.ix_(motors, hidden)]
+        of_state[:, 2 * H :] += stiff_w[motors]
+        of_input = inertia @ self.inputs[H : 2 * H]
+        of_input += np.hstack([m[np.ix_(motors, motors)] for m in (stiff, s.damping, s.mass)])
+        of_force = np.zeros((M, s.mass.shape[0]))
+        of_force[:, hidden] = inertia @ self.pushed[H : 2 * H]
+        of_force[np.arange(M), motors] = -1.0
+        return of_state, of_input, of_force
 
 
 def needed_torque(structure: Structure, motion: Motion) -> FloatArray:
@@ -121,22 +134,20 @@ def needed_torque(structure: Structure, motion: Motion) -> FloatArray:
     The hidden masses start with their springs as relaxed as the first row lets them, at their motor's
     velocity; what this is wrong by decays with their damping (see :meth:`HiddenSystem.free_torques`).
     """
-    u = np.hstack([motion.position, motion.velocity, motion.acceleration])
-    if structure.hidden.size == 0 and not structure.elements:
-        return HiddenSystem.of(structure).torque(np.zeros((motion.rows, 0)), u, None)
+    u = motion.inputs
     system = HiddenSystem.of(structure)
+    of_state, of_input, of_force = system.readout
+    if structure.hidden.size == 0 and not structure.elements:
+        return np.asarray(u @ of_input.T)
     start = _start(structure, motion)
-    driven = _compensated(u)
     if not structure.elements:
         advance, early, late, _, _ = system.held(motion.step)
-        following = np.vstack([driven[1:], driven[-1:]])
-        z = march(advance, driven @ early.T + following @ late.T, start)
-        return system.torque(z, u, None)
+        return np.asarray(march(advance, early, late, of_state, of_input, motion.driven, u, start))
     substeps = _substeps(system, motion.step)
     tables = system.held(motion.step / substeps)
     z, g = march_bent(
         *tables,
-        np.ascontiguousarray(driven),
+        motion.driven,
         start,
         motion.clock,
         substeps,
@@ -146,7 +157,7 @@ def needed_torque(structure: Structure, motion: Motion) -> FloatArray:
         np.array([(e.first, e.second) for e in structure.elements], dtype=np.int64),
         np.array([e.values for e in structure.elements], dtype=np.float64),
     )
-    return system.torque(z, u, g)
+    return np.asarray(u @ of_input.T + z @ of_state.T + g @ of_force.T)
 
 
 def dynamic_stiffness(structure: Structure, omega: FloatArray) -> NDArray[np.complex128]:
@@ -161,13 +172,6 @@ def dynamic_stiffness(structure: Structure, omega: FloatArray) -> NDArray[np.com
         moved = np.linalg.solve(inner, whole[:, hidden[:, None], motors])
         out = out - whole[:, motors[:, None], hidden] @ moved
     return np.asarray(out)
-
-
-def _compensated(u: FloatArray) -> FloatArray:
-    """Straight lines between samples are weaker than the motion by (w Ts)**2 / 12; take that back."""
-    out = u.copy()
-    out[1:-1] -= (u[2:] - 2.0 * u[1:-1] + u[:-2]) / 12.0
-    return out
 
 
 def _substeps(system: HiddenSystem, step: float) -> int:

@@ -18,23 +18,106 @@ CUBIC, GAP, STEP, DRY = 1, 2, 3, 4
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
-def march(step: FloatArray, forced: FloatArray, start: FloatArray) -> FloatArray:
-    """Return z of z[k+1] = step z[k] + forced[k] from z[0] = start, (n, S)."""
-    n, size = forced.shape
-    states = np.empty((n, size))
-    z = start.copy()
-    following = np.empty(size)
+def march(
+    step: FloatArray,
+    early: FloatArray,
+    late: FloatArray,
+    of_state: FloatArray,
+    of_input: FloatArray,
+    driven: FloatArray,
+    inputs: FloatArray,
+    start: FloatArray,
+) -> FloatArray:
+    """Return the motors' torques (n, M): of_state z[k] + of_input inputs[k], from z[0] = start.
+
+    z[k+1] = step z[k] + early driven[k] + late driven[k+1]; ``driven`` and ``inputs`` are (n, 3 M).
+    """
+    n, many = inputs.shape
+    size, M = start.size, of_input.shape[0]
+    out = np.empty((n, M))
+    z, following = start.copy(), np.empty(size)
     for k in range(n):
+        for i in range(M):
+            total = 0.0
+            for j in range(many):
+                total += of_input[i, j] * inputs[k, j]
+            for j in range(size):
+                total += of_state[i, j] * z[j]
+            out[k, i] = total
+        if k + 1 == n:
+            break
         for i in range(size):
-            states[k, i] = z[i]
-        for i in range(size):
-            total = forced[k, i]
+            total = 0.0
+            for j in range(many):
+                total += early[i, j] * driven[k, j] + late[i, j] * driven[k + 1, j]
             for j in range(size):
                 total += step[i, j] * z[j]
             following[i] = total
         for i in range(size):
             z[i] = following[i]
-    return states
+    return out
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def ring(step: FloatArray, of_state: FloatArray, starts: FloatArray, rows: int) -> FloatArray:
+    """Return the motors' torques from each initial state (F, S), (F, rows, M)."""
+    size, M, count = step.shape[0], of_state.shape[0], starts.shape[0]
+    out = np.zeros((count, rows, M))
+    z, following = np.empty(size), np.empty(size)
+    for first in range(count):
+        z[:] = starts[first]
+        for k in range(rows):
+            for i in range(M):
+                total = 0.0
+                for j in range(size):
+                    total += of_state[i, j] * z[j]
+                out[first, k, i] = total
+            for i in range(size):
+                total = 0.0
+                for j in range(size):
+                    total += step[i, j] * z[j]
+                following[i] = total
+            for i in range(size):
+                z[i] = following[i]
+    return out
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def both_ways(sections: FloatArray, at_rest: FloatArray, values: FloatArray) -> FloatArray:
+    """Filter the columns of (n, M) forward and backward; no phase is left, (n, M).
+
+    ``sections`` (K, 6) are those of a filter, ``at_rest`` (K, 2) their states for a constant 1.  Both
+    ends are continued by their mirror image through the end, 3 rows for each order.
+    """
+    n, M = values.shape
+    K = sections.shape[0]
+    more = min(3 * (2 * K + 1), n - 1)
+    out = np.empty((n + 2 * more, M))
+    for c in range(M):
+        for k in range(more):
+            out[k, c] = 2.0 * values[0, c] - values[more - k, c]
+            out[n + more + k, c] = 2.0 * values[n - 1, c] - values[n - 2 - k, c]
+        for k in range(n):
+            out[more + k, c] = values[k, c]
+    state = np.empty((M, K, 2))
+    last = n + 2 * more - 1
+    for way in range(2):
+        first = 0 if way == 0 else last
+        for c in range(M):
+            for s in range(K):
+                state[c, s, 0] = at_rest[s, 0] * out[first, c]
+                state[c, s, 1] = at_rest[s, 1] * out[first, c]
+        for k in range(last + 1):
+            row = k if way == 0 else last - k
+            for c in range(M):
+                x = out[row, c]
+                for s in range(K):
+                    y = sections[s, 0] * x + state[c, s, 0]
+                    state[c, s, 0] = sections[s, 1] * x - sections[s, 4] * y + state[c, s, 1]
+                    state[c, s, 1] = sections[s, 2] * x - sections[s, 5] * y
+                    x = y
+                out[row, c] = x
+    return out[more : more + n]
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]

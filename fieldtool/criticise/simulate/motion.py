@@ -7,12 +7,14 @@ and modelled torque filtered alike.  Laws that bend at standstill (friction) tak
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from math import comb
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import butter, sosfiltfilt
 
+from fieldtool.frf.held_targets import bends, bends_seen
 from fieldtool.records.recording import Experiment, Recording
 
 FloatArray = NDArray[np.float64]
@@ -48,12 +50,25 @@ class Motion:
     velocity: FloatArray
     acceleration: FloatArray
     torque: FloatArray
-    """As measured: N m, N or A."""
+    """As measured, less what a drive's targets bend it by: N m, N or A."""
     smooth_position: FloatArray
     """Without phase shift, low-passed above the band."""
     smooth_velocity: FloatArray
     counted: FloatArray
     """1 where the axis moves for sure, 0 where it may stand still or a difference lacks rows."""
+
+    @cached_property
+    def inputs(self) -> FloatArray:
+        """q, q', q'' of the motors side by side, (n, 3 M)."""
+        return np.hstack([self.position, self.velocity, self.acceleration])
+
+    @cached_property
+    def driven(self) -> FloatArray:
+        """The same for straight lines between samples, which are weaker by (w Ts)**2 / 12."""
+        u = self.inputs
+        out = u.copy()
+        out[1:-1] -= (u[2:] - 2.0 * u[1:-1] + u[:-2]) / 12.0
+        return out
 
     @property
     def rows(self) -> int:
@@ -88,16 +103,20 @@ def motions_of(
         Highest frequency that will be compared, Hz.
     """
     step, clock, motions = recording.sample_period, 0.0, []
+    shown = bends_seen(recording)[0]
     for experiment in experiments:
         if experiment.samples < FEWEST_ROWS:
             continue
         clock = max(clock, float(experiment.time[0]))
-        motions.append(_motion(experiment, step, clock, top))
+        torque = experiment.torque - shown * bends(recording, experiment)
+        motions.append(_motion(experiment, torque, step, clock, top))
         clock += experiment.samples * step
     return tuple(motions)
 
 
-def _motion(experiment: Experiment, step: float, begin: float, top: float) -> Motion:
+def _motion(
+    experiment: Experiment, torque: FloatArray, step: float, begin: float, top: float
+) -> Motion:
     position = experiment.position
     velocity = differentiate(position, FIRST, step)
     acceleration = differentiate(position, SECOND, step**2)
@@ -112,7 +131,7 @@ def _motion(experiment: Experiment, step: float, begin: float, top: float) -> Mo
         position,
         velocity,
         acceleration,
-        experiment.torque,
+        torque,
         smooth,
         smooth_velocity,
         _counted(smooth_velocity, white_noise(position), corner / (2 * step), step),

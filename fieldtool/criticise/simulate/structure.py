@@ -6,6 +6,7 @@ Degrees of freedom run chain after chain, motor side first, as in
 
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,7 +79,7 @@ class Structure:
             model.last_masses,
         )
 
-    @property
+    @cached_property
     def hidden(self) -> NDArray[np.intp]:
         """Degrees of freedom whose motion nobody measures, (H,)."""
         return np.setdiff1d(np.arange(self.mass.shape[0]), self.motors).astype(np.intp)
