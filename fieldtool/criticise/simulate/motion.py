@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import butter, sosfiltfilt
 
-from fieldtool.frf.held_targets import bends, bends_seen
+from fieldtool.frf.held_targets import folds
 from fieldtool.records.recording import Experiment, Recording
 
 FloatArray = NDArray[np.float64]
@@ -103,15 +103,25 @@ def motions_of(
         Highest frequency that will be compared, Hz.
     """
     step, clock, motions = recording.sample_period, 0.0, []
-    shown = bends_seen(recording)[0]
     for experiment in experiments:
         if experiment.samples < FEWEST_ROWS:
             continue
         clock = max(clock, float(experiment.time[0]))
-        torque = experiment.torque - shown * bends(recording, experiment)
-        motions.append(_motion(experiment, torque, step, clock, top))
+        motions.append(_motion(experiment, _acting(recording, experiment), step, clock, top))
         clock += experiment.samples * step
     return tuple(motions)
+
+
+def _acting(recording: Recording, experiment: Experiment) -> FloatArray:
+    """Return the measured torque, less what a drive's targets bend it by where it is sampled."""
+    torque, reference = experiment.torque.copy(), experiment.position_reference
+    if reference is None:
+        return torque
+    for fold in folds(recording):
+        sent = reference[:, fold.axis]
+        if np.all(np.isfinite(sent)):
+            torque[:, fold.axis] -= fold.course(sent, fold.size)
+    return torque
 
 
 def _motion(
