@@ -35,6 +35,7 @@ from fieldtool import workflow
 from fieldtool.cli.bus_options import Bitrate, Channel, Interface, on_bus
 from fieldtool.cli.check import check
 from fieldtool.cli.criticise import criticise
+from fieldtool.cli.distinguish import ToDistinguish, tell_apart
 from fieldtool.cli.output import Json, console_of, print_json
 from fieldtool.cli.profile import profile_app
 from fieldtool.cli.replay import replay_command
@@ -268,6 +269,7 @@ def measure(
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask before moving.")] = False,
     seconds: Seconds = None,
     plan_only: PlanOnly = False,
+    to_distinguish: ToDistinguish = None,
     interface: Interface = None,
     channel: Channel = None,
     bitrate: Bitrate = None,
@@ -281,6 +283,18 @@ def measure(
     traced = trace_path(trace, trace_file, folder)
     options = _options(plan, False, False, "measured", seconds, traced)
     console = console_of(as_json)
+    if to_distinguish is not None:
+        if plan_only:
+            raise typer.BadParameter(
+                "--plan-only and --to-distinguish: leave --plan-only and --yes out; the plan is "
+                "shown, and nothing moves without your answer"
+            )
+        with stop_key() as key, TerminalScreen(console, may_move(yes)) as screen:
+            tell_apart(
+                on_bus(machine, interface, channel, bitrate), to_distinguish, folder, options,
+                _StoppableScreen(screen, key), key, console, as_json,
+            )  # fmt: skip
+        return
     if plan_only:
         profile = on_bus(machine, interface, channel, bitrate)
         _show_plan(profile, options, console, as_json)

@@ -91,7 +91,7 @@ def criticise(
     NotEnoughDataError
         If nothing can be compared, or the model is of other axes.
     """
-    prepared = prepare(recording, _settling(_bare(model, prior)), contiguous)
+    prepared = prepare(recording, starting_model(model, prior), contiguous)
     try:
         with np.errstate(over="ignore", invalid="ignore"):
             found = search(prepared, without, advance, _accepted_base(prepared, model, prior))
@@ -130,6 +130,18 @@ def criticise(
         before,
         after,
     )
+
+
+def starting_model(model: MachineModel, prior: MachineModel | None) -> MachineModel:
+    """Return what a search starts from: the model without effects, and able to stand still.
+
+    Parameters
+    ----------
+    model : MachineModel
+    prior : MachineModel, optional
+        What it has of friction and couplings belongs to the machine.
+    """
+    return _settling(_bare(model, prior))
 
 
 def _bare(model: MachineModel, prior: MachineModel | None) -> MachineModel:

@@ -6,6 +6,7 @@ simulation may stand behind the bus.
 
 from fieldtool.workflow.checking import CheckResult, check
 from fieldtool.workflow.criticising import criticise_source as criticise
+from fieldtool.workflow.distinguishing import Distinguished, distinguish
 from fieldtool.workflow.fast_measuring import plan
 from fieldtool.workflow.models import prior_model, truth_model
 from fieldtool.workflow.next_plan import next_plan
@@ -23,6 +24,7 @@ from fieldtool.workflow.twin import Twin, twin
 
 __all__ = [
     "CheckResult",
+    "Distinguished",
     "Options",
     "Quiet",
     "Screen",
@@ -31,6 +33,7 @@ __all__ = [
     "check",
     "compare",
     "criticise",
+    "distinguish",
     "draw",
     "export_folder",
     "identify",

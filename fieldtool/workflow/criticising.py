@@ -69,7 +69,7 @@ def criticise_source(
     else:
         advance("identify", 0.0)
         model = identify_recording(recording, {}, prior).model
-    found = criticise(recording, model, _alike(prior, model), advance=advance)
+    found = criticise(recording, model, alike(prior, model), advance=advance)
     if folder:
         keep(folder, found, model)
         write_report(source)
@@ -103,7 +103,7 @@ def criticised(
             )
 
     session.screen.stage("Criticise the simulation: what it gets wrong, and why")
-    prior = _alike(prior_model(session.machine), model)
+    prior = alike(prior_model(session.machine), model)
     try:
         found = criticise(load(session.folder.recording), model, prior, advance=advance)
     except NotEnoughDataError as error:
@@ -168,7 +168,7 @@ def final_model(found: Criticised, model: MachineModel) -> MachineModel:
     return extended if known else replace(model, effects=extended.effects)
 
 
-def _alike(prior: MachineModel | None, model: MachineModel) -> MachineModel | None:
+def alike(prior: MachineModel | None, model: MachineModel) -> MachineModel | None:
     """Return the prior model if it is of the same axes, without effects."""
     if prior is None or prior.names != model.names:
         return None

@@ -19,6 +19,7 @@ from fieldtool.experiment.multisine.runner import run_multisine
 from fieldtool.experiment.stepped.design import undamped_modes
 from fieldtool.identify.likelihood.expected import Noise
 from fieldtool.identify.multisine.pilot import read_pilot
+from fieldtool.records.model import MachineModel
 from fieldtool.records.recording import Experiment, Recording, RecordingWriter
 from fieldtool.workflow.models import check_torque_scale, prior_model
 from fieldtool.workflow.planning import (
@@ -52,7 +53,7 @@ def measured_fast(session: Session, group: CanopenGroup, options: Options) -> fl
     """Back the parameters up, run pilot and main experiments, and return the seconds of excitation."""
     before = session.folder.parameters_before
     with backed_up(session.machine.name, group.drives, before), group.without_feed_forward():
-        return _Measurement(session, group, options).run()
+        return FastMeasurement(session, group, options).run()
 
 
 def plan(
@@ -111,12 +112,12 @@ def _guessed_noise(group: CanopenGroup) -> Noise:
     return Noise(GUESSED_NOISE * rated, counts / np.sqrt(12))
 
 
-class _Measurement:
+class FastMeasurement:
     """One fast measurement; what its steps share."""
 
     def __init__(self, session: Session, group: CanopenGroup, options: Options) -> None:
         self._session, self._group = session, group
-        self._setting = setting_of(session.machine, group, prior_model(session.machine))
+        self._setting = setting_of(session.machine, group, self.start_model())
         self._cycles = fast_cycle_times(self._setting.model, group.shortest_cycle)
         self._times = timing(
             self._setting, options.excitation_time or usual_seconds(self._setting.model)
@@ -125,6 +126,10 @@ class _Measurement:
         self._wanted = Wanted()
         self._offsets = group.torque_offsets
         self._axes: Axes = axes_of(group, self._setting)
+
+    def start_model(self) -> MachineModel:
+        """Return the model that is planned with before the pilot."""
+        return prior_model(self._session.machine)
 
     def run(self) -> float:
         """Return the seconds of excitation."""

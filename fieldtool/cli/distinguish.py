@@ -1,0 +1,57 @@
+"""``fieldtool measure MACHINE --to-distinguish SESSION``: measure what tells rivals apart."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.text import Text
+
+from drives.profile import MachineProfile
+from fieldtool import workflow
+from fieldtool.cli.criticise import SearchBar, show_criticism
+from fieldtool.cli.output import print_json
+from fieldtool.cli.stop_key import StopKey
+
+ToDistinguish = Annotated[
+    Path | None,
+    typer.Option(
+        "--to-distinguish",
+        help="Session folder whose criticism left a tie: measure what tells the rivals apart.",
+    ),
+]
+
+
+def tell_apart(
+    machine: MachineProfile,
+    earlier: Path,
+    folder: Path,
+    options: workflow.Options,
+    screen: workflow.Screen,
+    key: StopKey,
+    console: Console,
+    as_json: bool,
+) -> None:
+    """Plan, measure and criticise, and show what it came to."""
+    if options.plan != "fast":
+        raise typer.BadParameter("--to-distinguish is for the fast plan")
+    with SearchBar(console) as bar:
+
+        def advance(what: str, share: float) -> None:
+            key.check()
+            bar(what, share)
+
+        done = workflow.distinguish(
+            machine,
+            earlier,
+            folder,
+            options,
+            screen=screen,
+            stop_requested=key,
+            advance=advance,
+        )
+    show_criticism(console, done.criticism)
+    console.print(Text(done.answer, style="bold"))
+    console.print(Text(f"Both recordings, criticism and report are in {folder}."))
+    if as_json:
+        print_json(done.as_dict())

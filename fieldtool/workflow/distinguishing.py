@@ -1,0 +1,340 @@
+"""Measure what tells a cause from its rivals, where a criticism left a tie."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drives.canopen_drive import CanopenGroup
+from drives.profile import MachineProfile, load_machine
+from fieldtool.criticise.criticise import Criticised, criticise, starting_model
+from fieldtool.criticise.criticism import Cause, Criticism
+from fieldtool.criticise.criticism_file import read_criticism
+from fieldtool.criticise.separate import DECISIVE, Separation, separation
+from fieldtool.criticise.simulate.motion import white_noise
+from fieldtool.errors import FileFormatError, NotEnoughDataError, PlanRefusedError
+from fieldtool.experiment.forecast import Setting
+from fieldtool.experiment.multisine.design import SHARE_OF_LIMITS
+from fieldtool.experiment.multisine.forecast import forecast_multisine, scaled_to_limits
+from fieldtool.experiment.multisine.plan import MultisinePlan
+from fieldtool.experiment.stepped.design import undamped_modes
+from fieldtool.identify.likelihood.expected import Noise, expected_accuracy
+from fieldtool.identify.multisine.pilot import read_pilot
+from fieldtool.records.model import MachineModel
+from fieldtool.records.model_file import read_model, write_model
+from fieldtool.records.recording import Recording, load, save
+from fieldtool.records.session_folder import SessionFolder
+from fieldtool.workflow.criticising import Advance, alike, keep
+from fieldtool.workflow.fast_measuring import SEED, FastMeasurement
+from fieldtool.workflow.models import check_torque_scale, prior_model
+from fieldtool.workflow.planning import PlannedFast, Wanted, excitations, plan_main, plan_pilot
+from fieldtool.workflow.proposals import Ground, Proposal, expected_data, proposals
+from fieldtool.workflow.reporting import report
+from fieldtool.workflow.session import Options, Screen, Session, never, open_session
+from fieldtool.workflow.stopped import check_loops
+from fieldtool.writeback.temporary import backed_up
+
+SAME_CYCLE = 1e-9
+"""s: cycle times that differ by less are the same."""
+EARLIER = "earlier"
+"""Stands before the names of experiments that were measured before."""
+
+
+@dataclass(frozen=True, eq=False)
+class Question:
+    """A session whose criticism left a tie."""
+
+    folder: SessionFolder
+    recording: Recording
+    model: MachineModel
+    prior: MachineModel | None
+    criticism: Criticism
+    cause: Cause
+
+    @property
+    def words(self) -> str:
+        """Cause and rivals in words."""
+        rivals = " or ".join(t.effect for t in self.cause.ties)
+        return f"{self.cause.effect} or {rivals}, {self.cause.axis_words}"
+
+
+@dataclass(frozen=True)
+class Distinguished:
+    """What a measurement that was to tell rivals apart came to."""
+
+    folder: Path
+    question: str
+    answer: str
+    """One sentence."""
+    criticism: Criticism
+    machine_time: float
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values, as ``--json`` prints them."""
+        return {
+            "folder": str(self.folder),
+            "question": self.question,
+            "answer": self.answer,
+            "criticism": self.criticism.as_dict(),
+            "time": {"machine_s": self.machine_time},
+        }
+
+
+def question_of(folder_path: Path, machine: MachineProfile) -> Question:
+    """Read a session whose criticism left a tie.
+
+    Raises
+    ------
+    FileFormatError
+        If the folder lacks model, recording or criticism, or is of another machine.
+    PlanRefusedError
+        If its criticism leaves no tie.
+    """
+    folder = SessionFolder.existing(folder_path)
+    if not folder.criticism.is_file():
+        raise FileFormatError(
+            folder_path, "holds no criticism.yaml: `fieldtool criticise` on this folder first."
+        )
+    model, recording = read_model(folder.model), load(folder.recording)
+    criticism = read_criticism(folder.criticism, model)
+    names = tuple(a.name for a in machine.axes)
+    if model.names != names or recording.names != names:
+        raise FileFormatError(
+            folder_path,
+            f"is a session with the axes {', '.join(recording.names)}; {machine.name} has "
+            f"{', '.join(names)}.",
+        )
+    tied = [c for c in criticism.causes if c.ties]
+    if not tied:
+        raise PlanRefusedError(
+            f"{folder_path}: its criticism leaves no tie (verdict: {criticism.verdict}), so there "
+            "is nothing to tell apart. Nothing was moved."
+        )
+    return Question(
+        folder, recording, model, alike(prior_model(machine), model), criticism, tied[0]
+    )
+
+
+def distinguish(
+    machine: str | Path | MachineProfile,
+    earlier: Path,
+    out: Path,
+    options: Options | None = None,
+    *,
+    screen: Screen | None = None,
+    stop_requested: Callable[[], bool] = never,
+    advance: Advance = lambda *_: None,
+) -> Distinguished:
+    """Plan and run the experiment that tells a cause from its rivals; criticise all data together.
+
+    Parameters
+    ----------
+    machine
+        Name or file of a machine profile, or the profile.
+    earlier
+        Session folder whose criticism left a tie; it stays as it is.
+    out
+        New session folder: it gets both recordings.
+    options, screen, stop_requested
+        As for :func:`fieldtool.workflow.measure`.
+    advance
+        Told what is computed, and a number from 0 to 1.
+
+    Raises
+    ------
+    PlanRefusedError
+        If there is no tie, or nothing within the limits could decide it; nothing was moved.
+    DrivesError, FieldtoolError
+        As :func:`fieldtool.workflow.run`.
+    """
+    options = options or Options()
+    profile = machine if isinstance(machine, MachineProfile) else load_machine(machine)
+    question = question_of(earlier, profile)
+    with open_session(
+        profile, out, screen, stop_requested, command="distinguish", options=options
+    ) as (session, group):
+        session.folder.note("question", earlier=str(earlier), words=question.words)
+        before = session.folder.parameters_before
+        with backed_up(profile.name, group.drives, before), group.without_feed_forward():
+            work = _Distinguishing(session, group, options, question, advance)
+            seconds = work.run()
+    found = _judged(session, question, advance)
+    answer = _answer(question.cause, found.criticism)
+    session.folder.note("answer", words=answer)
+    session.screen.say(answer)
+    report(session.folder.path)
+    return Distinguished(out, question.words, answer, found.criticism, seconds)
+
+
+def _judged(session: Session, question: Question, advance: Advance) -> Criticised:
+    """Put both recordings into the new folder, and criticise them together."""
+    session.screen.stage("Criticise with both recordings")
+    folder = session.folder
+    new = load(folder.recording)
+    earlier = tuple(replace(e, name=f"{EARLIER} {e.name}") for e in question.recording.experiments)
+    both = replace(new, experiments=(*earlier, *new.experiments))
+    save(both, folder.recording)
+    write_model(question.model, folder.model)
+    found = criticise(both, question.model, question.prior, advance=advance)
+    keep(folder, found, question.model)
+    return found
+
+
+def _answer(cause: Cause, now: Criticism) -> str:
+    """Say what became of a tie."""
+    rivals = {t.effect for t in cause.ties}
+    for one in now.causes:
+        if one.axis != cause.axis or one.effect not in {cause.effect, *rivals}:
+            continue
+        left = {t.effect for t in one.ties} & {cause.effect, *rivals}
+        if left:
+            return (
+                f"Not told apart: {one.effect} of {one.axis_words}, or {', '.join(sorted(left))}."
+            )
+        against = ", ".join(sorted({cause.effect, *rivals} - {one.effect}))
+        return f"Told apart: it is {one.effect} of {one.axis_words}, and not {against}."
+    return (
+        f"With both recordings neither {cause.effect} nor {', '.join(sorted(rivals))} explains "
+        f"what is left (verdict: {now.verdict})."
+    )
+
+
+class _Distinguishing(FastMeasurement):
+    """A fast measurement whose experiments are those that tell rivals apart."""
+
+    def __init__(
+        self,
+        session: Session,
+        group: CanopenGroup,
+        options: Options,
+        question: Question,
+        advance: Advance,
+    ) -> None:
+        self._question, self._advance = question, advance
+        super().__init__(session, group, options)
+        step = question.recording.sample_period
+        self._cycles = tuple(t for t in self._cycles if abs(t - step) < SAME_CYCLE)
+        if not self._cycles:
+            raise PlanRefusedError(
+                f"{question.folder.path}: was measured with a cycle of {step * 1000:g} ms, which "
+                "this bus and machine do not allow now, so both recordings could not be put "
+                "together. Nothing was moved."
+            )
+        self._chosen: MultisinePlan | None = None
+
+    def start_model(self) -> MachineModel:
+        """Plan with the machine as it was identified."""
+        question = self._question
+        return replace(starting_model(question.model, question.prior), effects=())
+
+    def _plan_all(self, cycle_time: float) -> MultisinePlan:
+        """Find the experiments that decide, and show them; nothing has moved yet."""
+        question, screen = self._question, self._session.screen
+        screen.stage(f"Plan what tells apart: {question.words}")
+        apart = separation(
+            question.recording,
+            starting_model(question.model, question.prior),
+            question.criticism,
+            question.cause,
+            self._advance,
+        )
+        noise = _noise(question.recording)
+        pilot = plan_pilot(self._setting, cycle_time, self._times, SEED, self._offsets)
+        main = plan_main(
+            self._setting, cycle_time, noise, self._times, Wanted(), SEED + 1, self._offsets
+        )
+        best = self._best(apart, main.plan)
+        screen.say(f"Chosen: {best.words}.")
+        self._chosen = best.plan
+        screen.fast_plan(self._planned(best.plan, noise, pilot))
+        return pilot
+
+    def _best(self, apart: Separation, main: MultisinePlan) -> Proposal:
+        """Return the first proposal that decides by simulation.
+
+        Raises
+        ------
+        PlanRefusedError
+            If none does.
+        """
+        question, screen = self._question, self._session.screen
+        names = self._setting.model.names
+        axes = (
+            [question.cause.axis] if isinstance(question.cause.axis, str) else question.cause.axis
+        )
+        ground = Ground(self._setting, main, tuple(names.index(a) for a in axes), self._offsets)
+        tried: list[tuple[float, Proposal]] = []
+        pair = frozenset({question.cause.effect, question.cause.ties[0].effect})
+        for proposal in proposals(ground, pair):
+            self._advance(proposal.words, min(0.2 * len(tried), 0.9))
+            try:
+                evidence = apart.expected(expected_data(proposal.plan, self._setting))
+            except NotEnoughDataError:
+                continue
+            screen.say(
+                f"{proposal.words}: evidence {evidence:.3g} to expect ({DECISIVE:g} decide)."
+            )
+            tried.append((evidence, proposal))
+            if evidence >= DECISIVE:
+                return proposal
+        if not tried:
+            raise PlanRefusedError(
+                f"{question.words}: no experiment that could tell them apart fits the limits. "
+                "Nothing was moved. Wider limits, where the machine allows them, give more room."
+            )
+        evidence, nearest = max(tried, key=lambda t: t[0])
+        raise PlanRefusedError(
+            f"{question.words}: nothing within the limits would tell them apart; the nearest is "
+            f"{nearest.words}, with an evidence of {evidence:.2g} where {DECISIVE:g} decide. "
+            "Nothing was moved. Wider limits or more time (--time) would help, or knowing one of "
+            "them from a data sheet."
+        )
+
+    def _plan_after(
+        self,
+        recording: Recording,
+        pilot: MultisinePlan,  # noqa: ARG002 - what the others need to plan with
+    ) -> tuple[PlannedFast, Setting]:
+        """See that the machine is still the one that was planned with, and that all limits are kept."""
+        session, chosen = self._session, self._chosen
+        if chosen is None:
+            raise PlanRefusedError("nothing was planned")
+        found = read_pilot(recording, self._setting.model)
+        check_torque_scale(found.torque_ratio, self._setting.model)
+        for note in found.notes:
+            session.warn(note)
+        modes = ", ".join(f"{w / (2 * np.pi):.2f}" for w in undamped_modes(found.model)[0])
+        session.screen.say(f"Resonances found: {modes} Hz." if modes else "The axes are rigid.")
+        known = replace(self._setting, model=found.model)
+        check_loops(known)
+        try:
+            forecast_multisine(chosen, known)
+        except PlanRefusedError:
+            chosen = scaled_to_limits(chosen, known, SHARE_OF_LIMITS)
+            session.screen.say("By what the pilot has found, the excitation has to be weaker.")
+        planned = replace(self._planned(chosen, found.noise, None), rests_on="pilot's model")
+        session.screen.fast_plan(planned)
+        return planned, known
+
+    def _planned(
+        self, plan: MultisinePlan, noise: Noise, pilot: MultisinePlan | None
+    ) -> PlannedFast:
+        setting = self._setting
+        return PlannedFast(
+            plan,
+            forecast_multisine(plan, setting),
+            expected_accuracy(setting.model, excitations(plan, setting), noise),
+            Wanted(),
+            "machine as identified before",
+            pilot,
+        )
+
+
+def _noise(recording: Recording) -> Noise:
+    found = [
+        np.median([white_noise(getattr(e, what)) for e in recording.experiments], axis=0)
+        for what in ("torque", "position")
+    ]
+    return Noise(found[0], found[1])
