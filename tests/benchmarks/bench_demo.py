@@ -10,12 +10,13 @@ import argparse
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
-from drives.profile import load_machine
+from drives.profile import MachineProfile, load_machine
 from drives.sim.lockstep_bus import register, unregister
 from drives.sim.machine import simulated_machine
 from fieldtool import workflow
@@ -97,10 +98,9 @@ def rows(
 CLASSIC = Options(plan="classic", write=True)
 
 
-def run(
-    name: str, seed: int, folder: Path, options: Options = CLASSIC
-) -> tuple[SessionResult, Watch]:
-    """One session on the machine of this name with this seed of its noise."""
+@contextmanager
+def on_the_bus(name: str, seed: int) -> Iterator[MachineProfile]:
+    """The machine of this name with this seed of its noise, on a bus of its own."""
     machine = load_machine(name)
     if machine.simulation is None:
         raise SystemExit(f"machine {name} has no simulation")
@@ -111,11 +111,19 @@ def run(
         }
     )
     register(CHANNEL, simulated_machine(machine))
-    watch = Watch()
     try:
-        result = workflow.run(machine, folder, options, screen=watch, confirm=lambda _: True)
+        yield machine
     finally:
         unregister(CHANNEL)
+
+
+def run(
+    name: str, seed: int, folder: Path, options: Options = CLASSIC
+) -> tuple[SessionResult, Watch]:
+    """One session on the machine of this name with this seed of its noise."""
+    watch = Watch()
+    with on_the_bus(name, seed) as machine:
+        result = workflow.run(machine, folder, options, screen=watch, confirm=lambda _: True)
     return result, watch
 
 

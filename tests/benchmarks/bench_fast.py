@@ -19,12 +19,12 @@ import time
 from pathlib import Path
 
 import numpy as np
-from bench_demo import CLASSIC, rows, run
+from bench_demo import CLASSIC, on_the_bus, rows
 from scipy.stats import f
 
 from drives.profile import load_machine
 from fieldtool.records.model import MachineModel
-from fieldtool.workflow import Options, identify
+from fieldtool.workflow import Options, identify, measure
 from fieldtool.workflow.models import truth_model
 
 LIMITS = {"mass": 0.3, "spring": 0.3, "coupling": 1.0, "damper": 10.0}
@@ -89,15 +89,14 @@ def _session(
     machine: str, seed: int, options: Options, keep: Path | None
 ) -> tuple[MachineModel, float]:
     """Measure and identify; a session that was kept is identified again."""
-    kept = None if keep is None else keep / f"{machine}-{seed}"
-    if kept is not None and (kept / MACHINE_TIME).is_file():
-        seconds = float((kept / MACHINE_TIME).read_text(encoding="utf-8"))
-        return identify(kept, options).model, seconds
-    with tempfile.TemporaryDirectory() as folder:
-        result, _ = run(machine, seed, kept or Path(folder) / "session", options)
-    if kept is not None:
-        (kept / MACHINE_TIME).write_text(f"{result.machine_time}", encoding="utf-8")
-    return result.model, result.machine_time
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = (keep or Path(temporary)) / f"{machine}-{seed}"
+        done = folder / MACHINE_TIME
+        if not done.is_file():
+            with on_the_bus(machine, seed) as profile:
+                seconds = measure(profile, folder, options)
+            done.write_text(f"{seconds}", encoding="utf-8")
+        return identify(folder, options).model, float(done.read_text(encoding="utf-8"))
 
 
 def _show(
