@@ -173,6 +173,7 @@ def _behaviour(dictionary: ObjectDictionary) -> Iterator[str]:
     yield "# What the drive asks of SYNC (cycle times as `1 ms`), and what it does when one is missing."
     yield "sync: {shortest: unknown, longest: unknown, multiple: unknown, missing: unknown}"
     yield "interpolation: unknown   # linear: straight from one cyclic target to the next"
+    yield "loop_period: unknown     # of position and velocity loop, such as 0.25 ms"
     offset = info_at(dictionary, _TORQUE_OFFSET.address)
     if offset is not None and offset.type == _TORQUE_OFFSET.type:
         yield "# Whether 0x60B2 is added to the torque at every SYNC in cyclic position mode"

@@ -18,6 +18,7 @@ from drives.profile.values import (
     LocatedError,
     Name,
     Part,
+    Seconds,
     Unknown,
     unknown_keys,
 )
@@ -67,6 +68,8 @@ class DriveProfile(Part):
     """Exponent of ten that 0x60C2:2 gets."""
     torque_lag: Delay = 0.0
     """From the drive's reference to the torque that it reports: current loop and inner sampling."""
+    loop_period: Seconds | Unknown = UNKNOWN
+    """Of position and velocity loop: how often they see the encoder."""
     torque_offset: bool | Unknown = False
     """Whether the drive adds 0x60B2 to its torque reference in cyclic position mode, at every SYNC,
     so that torques may be streamed together with positions."""

@@ -54,6 +54,22 @@ class LoopProfile(Part):
     """kg m2 or kg."""
 
 
+class MoveProfile(Part):
+    """A move that the axis usually makes, SI: what its parameters are to be good at."""
+
+    distance: Positive
+    """rad or m."""
+    velocity: Positive
+    """rad/s or m/s."""
+    acceleration: Positive
+    """rad/s2 or m/s2."""
+    jerk: Positive | None = None
+    """rad/s3 or m/s3; none: the acceleration builds up over a quarter of the time to speed up."""
+    band: Positive | None = None
+    """rad or m to both sides of the target within which the axis has arrived; none: a hundredth of
+    the distance."""
+
+
 class AxisProfile(Part):
     """One axis of a machine."""
 
@@ -80,6 +96,8 @@ class AxisProfile(Part):
     """The drive's gains as they are now, for drives whose gains the tool can not read in SI."""
     motor_inertia: MotorInertia | None = None
     limits: Limits
+    typical_move: MoveProfile | None = None
+    """None: one that follows from the limits."""
     prior: ChainProfile
     """The axis as last accepted."""
 
@@ -120,6 +138,18 @@ class AxisProfile(Part):
         low, high = self.limits.travel
         if low >= high:
             raise ValueError(f"travel must go from low to high, got {low} to {high}")
+        move = self.typical_move
+        if move is not None:
+            for name, wanted, limit in (
+                ("distance", move.distance, high - low),
+                ("velocity", move.velocity, self.limits.velocity),
+                ("acceleration", move.acceleration, self.limits.acceleration),
+            ):
+                if wanted > limit:
+                    raise LocatedError(
+                        ("typical_move", name),
+                        f"{wanted:g} is more than the limits allow, {limit:g}",
+                    )
         return self
 
 

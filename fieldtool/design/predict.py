@@ -52,6 +52,10 @@ class Curves:
     torque: FloatArray
     """N m or N."""
     step_time: FloatArray
+    frequency: FloatArray
+    """Hz."""
+    sensitivity: FloatArray
+    """abs(1 / (1 + L)) of the axis' loop with all others closed."""
     step: FloatArray
     """Motor after a unit step of the reference, without feed-forward."""
 
@@ -113,6 +117,15 @@ class Prediction:
                 return one
         raise KeyError(axis)
 
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> "Prediction":
+        """Inverse of :meth:`as_dict`; what is null is infinite (times, peaks) or no number."""
+        return cls(
+            tuple(_axis_from(axis) for axis in data["axes"]),
+            bool(data["stable"]),
+            _number(data["sensitivity_peak"], inf),
+        )
+
     def as_dict(self) -> dict[str, Any]:
         """Plain values."""
         return {
@@ -154,7 +167,8 @@ def predict(
     axes = []
     spreads = _spreads(samples, servos, moves) if steady and samples else [{} for _ in servos]
     for k, (servo, move) in enumerate(zip(servos, moves, strict=True)):
-        moved = _moved(machine, servos, k, move, values) if steady else None
+        seen = (loops.response.omega / (2 * np.pi), np.abs(loops.sensitivity[:, k]))
+        moved = _moved(machine, servos, k, move, values, seen) if steady else None
         axes.append(
             AxisPrediction(
                 machine.names[k],
@@ -228,7 +242,12 @@ def _wave(values: ComplexArray, beyond: float, shortest: float) -> HalfWave:
 
 
 def _moved(
-    machine: Machine, servos: tuple[Servo, ...], axis: int, move: TestMove, values: ComplexArray
+    machine: Machine,
+    servos: tuple[Servo, ...],
+    axis: int,
+    move: TestMove,
+    values: ComplexArray,
+    seen: tuple[FloatArray, FloatArray],
 ) -> _Moved:
     wave = _wave(values, move.duration, move.duration / 200)
     drive = wave.spectrum(wave.move(move))
@@ -242,7 +261,7 @@ def _moved(
     half, time = 0.5 * move.distance, wave.time
     reference = move.at(time)[0]
     band = move.settling_band
-    curves = Curves(time, reference, motor + half, load + half, torque, time, stepped)
+    curves = Curves(time, reference, motor + half, load + half, torque, time, *seen, stepped)
     return _Moved(
         move_figures(time, reference, curves.position, band),
         move_figures(time, reference, curves.load, band),
@@ -272,6 +291,28 @@ def _spreads(
 def _range(values: Sequence[float]) -> tuple[float, float]:
     low, high = np.percentile(values, SPREAD, method="nearest")
     return float(low), float(high)
+
+
+def _number(value: Any, otherwise: float) -> float:
+    return otherwise if value is None else float(value)
+
+
+def _axis_from(data: Mapping[str, Any]) -> AxisPrediction:
+    def figures(kind: Any, name: str) -> Any:
+        given = data[name]
+        return None if given is None else kind(**{k: _number(v, inf) for k, v in given.items()})
+
+    return AxisPrediction(
+        str(data["axis"]),
+        figures(Margins, "margins"),
+        figures(MoveFigures, "move"),
+        figures(MoveFigures, "load"),
+        figures(StepFigures, "step"),
+        _number(data["compliance"], nan),
+        _number(data["noise"], nan),
+        _number(data["peak_torque"], nan),
+        {k: (_number(a, inf), _number(b, inf)) for k, (a, b) in data["spread"].items()},
+    )
 
 
 def finite(data: Any) -> Any:

@@ -12,6 +12,7 @@ loop's lag (Franklin, Powell, Workman, Digital Control of Dynamic Systems, 1998,
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -96,10 +97,8 @@ class Servo:
             One step of the encoder, rad or m.
         """
         period = self.timing.period or CAUTIOUS_PERIOD
+        omega, s, rate = _rates(period)
         nyquist = np.pi / period
-        omega = np.geomspace(nyquist / 1e4, nyquist, 300)
-        s = 1j * omega
-        rate: ComplexArray = (1 - np.exp(-period * s)) / period
         velocity = rate
         if self.velocity_filter != OFF:
             share = -np.expm1(-2 * np.pi * self.velocity_filter * period)
@@ -107,6 +106,14 @@ class Servo:
         gain = self._torque(s) * self.loop.velocity_p * (self.loop.position_p + velocity)
         power = np.trapezoid(np.abs(gain) ** 2, omega) / nyquist
         return float(resolution / np.sqrt(12) * np.sqrt(power))
+
+
+@cache
+def _rates(period: float) -> tuple[FloatArray, ComplexArray, ComplexArray]:
+    """Return frequencies up to half the rate, j times them, and the difference quotient there."""
+    omega = np.geomspace(np.pi / period / 1e4, np.pi / period, 120)
+    s = 1j * omega
+    return omega, s, (1 - np.exp(-period * s)) / period
 
 
 def servo_from_parameters(values: Mapping[str, float], timing: Timing) -> Servo:

@@ -1,18 +1,22 @@
-"""From the model to controller parameters."""
+"""A design's result: parameters of all axes, and what they will do."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from math import sqrt
 
 import numpy as np
 
-from fieldtool.design.rule import (
-    DesignError,
-    lowest_antiresonance,
-    rule_with_notches,
-    sensitivity_peak,
-)
-from fieldtool.records.closed_loop import AxisLoop, ClosedLoop
-from fieldtool.records.model import AxisModel, MachineModel
+from fieldtool.design.drive_side import FILTERS, DriveSide
+from fieldtool.design.moves import TestMove
+from fieldtool.design.predict import Prediction
+from fieldtool.design.servo import OFF, Servo
+from fieldtool.design.shaping import Shaping
+from fieldtool.records.closed_loop import Biquad
+
+RESPONSES: Mapping[str, float] = {"soft": 0.4, "normal": 0.7, "stiff": 1.0}
+"""A technician's choices: the part of the room between 1 and the bound that the peak of sensitivity uses."""
+BOUND = 2.0
+"""Peak of sensitivity that no axis may exceed: 6 dB."""
 
 
 @dataclass(frozen=True)
@@ -28,93 +32,71 @@ class AxisTuning:
 
 
 @dataclass(frozen=True)
+class TradePoint:
+    """All axes' gains scaled together: what is gained and lost."""
+
+    factor: float
+    """Of velocity_p and position_p; velocity_i goes with its square."""
+    bandwidth: tuple[float, ...]
+    """Hz, an axis each."""
+    sensitivity_peak: tuple[float, ...]
+    """An axis each; infinite where the machine is not stable."""
+
+
+@dataclass(frozen=True)
 class Tuning:
     """New parameters of all axes."""
 
     axes: tuple[AxisTuning, ...]
+    response: str = ""
+    """A name of RESPONSES; empty where nobody chose."""
+    bound: float = BOUND
+    """Peak of sensitivity that was allowed."""
+    moves: tuple[TestMove, ...] = ()
+    """One an axis: what the prediction is of."""
+    prediction: Prediction | None = None
+    present: Prediction | None = None
+    """Of the drives' parameters as they were; None where they could not be read."""
+    trade: tuple[TradePoint, ...] = ()
+    shaping: tuple[Shaping, ...] = ()
+    """Advice for whatever makes the references; empty where no vibration is left."""
+    notes: tuple[str, ...] = field(default=())
+    """What a technician has to know, a sentence each."""
 
 
-def design(model: MachineModel, tunable: Mapping[str, frozenset[str]] | None = None) -> Tuning:
-    """Return parameters for every axis of an identified machine.
+def as_parameters(servo: Servo, side: DriveSide | None = None) -> dict[str, float]:
+    """Return a controller as parameters by name, of those that a drive has; filters not used are off.
 
     Parameters
     ----------
-    model
-        The machine.
-    tunable
-        Names of the parameters that each axis' drive has; an axis that is not named has all.  A
-        notch is designed only where there is a filter for it.
-
-    Raises
-    ------
-    DesignError
-        If the model is no machine, the loops are not stable, or the margin can not be kept.
+    servo
+        The controller; its filters go to the drive's filters in order.
+    side
+        The drive; None: one that has everything.
     """
-
-    def has(axis: str, parameter: str) -> bool:
-        return tunable is None or axis not in tunable or parameter in tunable[axis]
-
-    loops = rule_with_notches(model)
-    loops = [
-        loop if has(axis.name, "filter1_type") else replace(loop, filters=())
-        for axis, loop in zip(model.axes, loops, strict=True)
-    ]
-    closed = ClosedLoop(model, tuple(loops))
-    if not closed.stable:
-        raise DesignError(
-            "the machine is not stable with the designed parameters; nothing is written. Check the "
-            "model: are all masses and springs plausible?"
-        )
-    return Tuning(
-        tuple(
-            AxisTuning(
-                axis.name,
-                {n: v for n, v in as_parameters(loop).items() if has(axis.name, n)},
-                sensitivity_peak(model, loops, k),
-                _reason(axis, loop),
-            )
-            for k, (axis, loop) in enumerate(zip(model.axes, loops, strict=True))
-        )
-    )
-
-
-def as_parameters(loop: AxisLoop) -> dict[str, float]:
-    """Return a loop as parameters by name; filter 2 is switched off."""
+    side = side or DriveSide("")
+    loop = servo.loop
     parameters = {
         "position_p": loop.position_p,
         "velocity_p": loop.velocity_p,
         "velocity_i": loop.velocity_i,
         "velocity_ff": loop.velocity_ff,
         "inertia_ff": loop.inertia_ff,
-        "filter1_type": 0.0,
-        "filter2_type": 0.0,
     }
-    if loop.filters:
-        (n2, n1, n0), (d1, d0) = loop.filters[0].numerator, loop.filters[0].denominator
-        w = float(np.sqrt(n0 / n2))
-        parameters |= {
-            "filter1_type": 1.0,
-            "filter1_frequency": w / (2 * np.pi),
-            "filter1_zero_damping": n1 / (2 * w * n2),
-            "filter1_pole_damping": d1 / (2 * float(np.sqrt(d0))),
-        }
+    if servo.velocity_filter != OFF:
+        parameters["velocity_filter"] = servo.velocity_filter
+    parameters |= _filters(loop.filters, side.filters or FILTERS)
+    return {name: value for name, value in parameters.items() if side.has(name)}
+
+
+def _filters(biquads: Sequence[Biquad], places: Sequence[int]) -> dict[str, float]:
+    parameters = {f"filter{k}_type": 0.0 for k in places}
+    for k, biquad in zip(places, biquads, strict=False):
+        (n2, n1, n0), (d1, d0) = biquad.numerator, biquad.denominator
+        w = sqrt(d0)
+        parameters[f"filter{k}_type"] = 1.0 if n2 else 2.0
+        parameters[f"filter{k}_frequency"] = w / (2 * np.pi)
+        if n2:
+            parameters[f"filter{k}_zero_damping"] = n1 / (2 * sqrt(n0 / n2) * n2)
+        parameters[f"filter{k}_pole_damping"] = d1 / (2 * w)
     return parameters
-
-
-def _reason(axis: AxisModel, loop: AxisLoop) -> str:
-    lowest = lowest_antiresonance(axis)
-    aim = (
-        f"lowest antiresonance {lowest / (2 * np.pi):.3g} Hz"
-        if np.isfinite(lowest)
-        else "a rigid axis"
-    )
-    bandwidth = loop.velocity_p / axis.total_mass
-    notch = (
-        "a notch at the dominating resonance"
-        if loop.filters
-        else "no notch (the margin does not allow it)"
-    )
-    return (
-        f"total inertia {axis.total_mass:.4g}, {aim}: velocity bandwidth "
-        f"{bandwidth / (2 * np.pi):.3g} Hz, {notch}."
-    )

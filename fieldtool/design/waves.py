@@ -6,6 +6,7 @@ within T; what has not is folded back, which :attr:`HalfWave.duration` has to be
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -26,12 +27,12 @@ class HalfWave:
     samples: int
     """N, even."""
 
-    @property
+    @cached_property
     def time(self) -> FloatArray:
         """Shape (N,), s, from 0."""
         return np.arange(self.samples, dtype=np.float64) * (self.duration / self.samples)
 
-    @property
+    @cached_property
     def omega(self) -> FloatArray:
         """Shape (N / 2,), rad/s."""
         return (2 * np.arange(self.samples // 2, dtype=np.float64) + 1) * (np.pi / self.duration)
@@ -42,11 +43,11 @@ class HalfWave:
 
     def signal(self, spectrum: ComplexArray) -> FloatArray:
         """Return the signal of phasors, shape (N / 2,) or fewer (the others are 0), as shape (N,)."""
-        whole = np.zeros(self.samples, dtype=np.complex128)
-        whole[: spectrum.size] = spectrum
-        return np.asarray(2 * (self._twist * np.fft.ifft(whole)).real)
+        twisted = np.fft.ifft(spectrum, self.samples)
+        twisted *= self._twist
+        return np.asarray(2 * twisted.real)
 
-    @property
+    @cached_property
     def _twist(self) -> ComplexArray:
         return np.asarray(np.exp(1j * np.pi * np.arange(self.samples) / self.samples))
 

@@ -8,14 +8,14 @@ import numpy as np
 
 from drives.api import AxisLimits
 from drives.profile import load_machine
-from fieldtool.design.tuning import design
+from fieldtool.design.rule import rule
 from fieldtool.errors import IdentificationError
 from fieldtool.experiment.forecast import Setting
 from fieldtool.experiment.multisine.design import fast_cycle_times, longest_cycle
 from fieldtool.identify.likelihood.expected import Noise
 from fieldtool.identify.multisine.pilot import measured_noise
 from fieldtool.identify.recorded import Identified
-from fieldtool.records.closed_loop import AxisLoop, loop_from_parameters
+from fieldtool.records.closed_loop import AxisLoop
 from fieldtool.records.model import FloatArray
 from fieldtool.records.recording import Recording, load
 from fieldtool.records.session_folder import SessionFolder
@@ -82,10 +82,7 @@ def _loops(recording: Recording, found: Identified) -> tuple[AxisLoop, ...]:
             for axis in recording.axes
             if (c := axis.controller) is not None
         )
-    return tuple(
-        loop_from_parameters({**axis.parameters, "velocity_ff": 0.0, "inertia_ff": 0.0})
-        for axis in design(found.model).axes
-    )
+    return tuple(replace(loop, velocity_ff=0.0, inertia_ff=0.0) for loop in rule(found.model))
 
 
 def _envelope(recording: Recording) -> tuple[AxisLimits, ...]:

@@ -9,30 +9,28 @@ import numpy as np
 
 from drives.bus import not_imitated
 from drives.canopen_drive import CanopenGroup, connect
-from drives.canopen_drive.group import profile_of
 from drives.errors import NotSupportedError, ProfileError, UserStopError
 from drives.parameters import Change
 from drives.profile import MachineProfile, load_machine
-from fieldtool.design.tuning import Tuning, design
-from fieldtool.design.tuning_file import read_tuning, tuning_as_dict
+from fieldtool.design.tuning import Tuning
+from fieldtool.design.tuning_file import read_tuning
 from fieldtool.errors import (
     FieldtoolError,
     FileFormatError,
-    IdentificationError,
     NotEnoughDataError,
 )
 from fieldtool.frf.response import ModelBand, save_responses
 from fieldtool.identify.likelihood.model_band import relative_std
 from fieldtool.identify.recorded import Identified, identify_recording
 from fieldtool.records.model import Estimate, MachineModel
-from fieldtool.records.model_file import read_model, write_model
+from fieldtool.records.model_file import write_model
 from fieldtool.records.recording import (
     load,
 )
 from fieldtool.records.session_folder import SessionFolder
-from fieldtool.records.yaml_file import write_yaml
 from fieldtool.report.pictures import draw_responses
 from fieldtool.workflow.criticising import criticised
+from fieldtool.workflow.designing import check_known, designed
 from fieldtool.workflow.fast_measuring import measured_fast
 from fieldtool.workflow.measuring import measured
 from fieldtool.workflow.models import (
@@ -55,8 +53,6 @@ from fieldtool.workflow.session import (
 from fieldtool.writeback.restoring import Restored, bring_back, source_of
 from fieldtool.writeback.transaction import WriteBack, apply, changes_for
 
-NOT_KNOWN = 0.3
-"""Relative standard error of a mass or spring from which no controller is designed."""
 BAND_POINTS = 400
 """Frequencies at which the band of the model's response is kept."""
 DATA_SHEET_APART = 4.0
@@ -210,18 +206,6 @@ def draw(identified: Identified, path: Path) -> None:
         identified.fitted,
         identified.torque_units,
     )
-
-
-def redesign(folder_path: Path) -> Tuning:
-    """Design parameters from a session folder's model and keep them there.
-
-    Raises
-    ------
-    FileFormatError
-        If there is no model.
-    """
-    folder = SessionFolder(folder_path)
-    return _design(folder, load_machine(folder.machine), read_model(folder.model))
 
 
 def write(
@@ -395,32 +379,9 @@ def _band(identified: Identified) -> ModelBand | None:
     return ModelBand(grid, relative_std(identified.fitted, 2 * np.pi * grid))
 
 
-def check_known(model: MachineModel) -> None:
-    """Refuse a model with a mass or spring that is not known well enough to design from.
-
-    Raises
-    ------
-    IdentificationError
-        Naming it, its value and its error.
-    """
-    for axis in model.axes:
-        for what, values in (("mass", axis.masses), ("spring", axis.springs)):
-            for k, value in enumerate(values):
-                if value.std > NOT_KNOWN * abs(value.value):
-                    raise IdentificationError(
-                        f"{axis.name} {what} {k + 1} is {value.value:.4g} +- {1.96 * value.std:.2g}: "
-                        "that is not known, so no controller is designed. Give the number of masses "
-                        "with `fieldtool identify FOLDER --masses AXIS=N`, or measure longer (--time). "
-                        "The recording is kept."
-                    )
-
-
 def _design(folder: SessionFolder, machine: MachineProfile, model: MachineModel) -> Tuning:
     check_known(model)
-    tunable = {axis.name: profile_of(axis, machine).tunable for axis in machine.axes}
-    tuning = design(model, tunable)
-    write_yaml(folder.tuning, tuning_as_dict(tuning))
-    return tuning
+    return designed(folder, machine, model)
 
 
 def _write(

@@ -1,0 +1,62 @@
+"""What effects that are not linear do to a design: sentences for a technician, with their numbers."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from fieldtool.design.machine import number
+from fieldtool.design.servo import Servo
+from fieldtool.records.model import MachineModel
+
+DRY = ("coulomb_friction", "stribeck_friction", "asymmetric_friction")
+
+
+def notes_of(model: MachineModel, servos: Sequence[Servo]) -> list[str]:
+    """Return what the model's effects mean for the designed loops, a sentence each.
+
+    Dry friction holds a motor up to its torque over the loop's stiffness away from the target until
+    the integral has grown; with an integral it may then move past the target and stick again
+    (hunting; Armstrong-Helouvry, Dupont, Canudas de Wit, Automatica 30, 1994).
+    """
+    notes = []
+    for effect in model.effects:
+        kind, name = effect.get("effect"), effect.get("axis")
+        if not isinstance(name, str) or name not in model.names:
+            continue
+        servo = servos[model.names.index(name)]
+        unit = "rad" if model.axes[model.names.index(name)].kind == "rotary" else "m"
+        if kind in DRY:
+            notes += _friction(name, effect, servo, unit)
+        elif kind == "backlash":
+            gap = number(effect, "gap") or 2 * number(effect, "half_gap")
+            notes.append(
+                f"{name}: the backlash of {gap:.3g} {unit} makes the last mass uncertain by as much, and "
+                "small oscillations about a target are possible; the margin was kept with a softened "
+                "joint as well."
+            )
+        elif kind == "measurement_delay" and number(effect, "delay") > 0:
+            notes.append(
+                f"{name}: positions come {1e3 * number(effect, 'delay'):.3g} ms late; nobody knows "
+                "whether the drive's own loops get them as late, so the margin was kept both ways."
+            )
+    return notes
+
+
+def _friction(name: str, effect: Mapping[str, Any], servo: Servo, unit: str) -> list[str]:
+    loop = servo.loop
+    torque = max(
+        number(effect, "torque"),
+        number(effect, "breakaway"),
+        number(effect, "coulomb_positive"),
+        number(effect, "coulomb_negative"),
+    )
+    if torque <= 0:
+        return []
+    stiffness = loop.velocity_p * loop.position_p + loop.velocity_i
+    away = torque / stiffness
+    if loop.velocity_i <= 0:
+        return [f"{name}: dry friction may hold the motor up to {away:.3g} {unit} off its target."]
+    return [
+        f"{name}: dry friction of {torque:.3g} may hold the motor up to {away:.3g} {unit} off its target "
+        f"for about {loop.velocity_p / loop.velocity_i:.2g} s, and then let it creep or hunt; settling "
+        "will take longer than predicted where the band is smaller than that."
+    ]

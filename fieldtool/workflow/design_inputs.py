@@ -1,0 +1,247 @@
+"""What a design needs to know of a machine's drives and axes, from its profile and session folder."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from math import inf, isfinite, nan, pi
+from pathlib import Path
+
+import h5py
+
+from drives.canopen_drive.conversion import Conversion
+from drives.canopen_drive.group import profile_of
+from drives.errors import NotSupportedError, ProfileError
+from drives.objects import ObjectAddress, type_range
+from drives.parameters import DriveBackup, load_backup
+from drives.profile import UNKNOWN, AxisProfile, DriveProfile, MachineProfile
+from fieldtool.design.drive_side import GAINS, DriveSide, Hold
+from fieldtool.design.moves import JERK_SHARE, SHORTEST_JERK, TestMove, typical_move
+from fieldtool.design.servo import CAUTIOUS_LAG, CAUTIOUS_PERIOD, Timing
+from fieldtool.records.model import MachineModel
+from fieldtool.records.session_folder import SessionFolder
+
+REAL_LARGEST = {"REAL32": 3.4e38, "REAL64": 1.7e308}
+
+
+def moves_of(machine: MachineProfile, model: MachineModel) -> tuple[TestMove, ...]:
+    """Return the typical move of each axis: the profile's, or one that follows from the limits.
+
+    A move follows the unit of the limits; it never takes more than the axis' torque limit allows a
+    rigid axis of the model's masses.
+    """
+    masses = {axis.name: axis.total_mass for axis in model.axes}
+    return tuple(_move(axis, masses[axis.name]) for axis in machine.axes)
+
+
+def _move(axis: AxisProfile, mass: float) -> TestMove:
+    limits, wanted = axis.limits, axis.typical_move
+    if wanted is None:
+        return typical_move(
+            axis.name,
+            (limits.travel[0], limits.travel[1]),
+            limits.velocity,
+            limits.acceleration,
+            limits.torque,
+            mass,
+        )
+    rise = max(JERK_SHARE * wanted.velocity / wanted.acceleration, SHORTEST_JERK)
+    return TestMove(
+        axis.name,
+        wanted.distance,
+        wanted.velocity,
+        wanted.acceleration,
+        wanted.jerk or wanted.acceleration / rise,
+        wanted.band or 0.0,
+    )
+
+
+def timing_of(profile: DriveProfile, cycle: float = 0.0) -> Timing:
+    """Return when a drive's loops act; cautious numbers where its profile does not know.
+
+    Parameters
+    ----------
+    profile
+        Of the drive.
+    cycle
+        s, from one cyclic target to the next.
+    """
+    period = CAUTIOUS_PERIOD if profile.loop_period == UNKNOWN else float(profile.loop_period)
+    return Timing(profile.torque_lag or CAUTIOUS_LAG, period, cycle)
+
+
+@dataclass(frozen=True)
+class _Kept:
+    """What the session folder holds of one drive."""
+
+    backup: DriveBackup | None
+    why_not: str
+    rated_torque: float
+    """NaN where nobody kept it."""
+    counts_per_rev: float
+
+
+def drive_sides(
+    folder: SessionFolder, machine: MachineProfile, cycle: float | None = None
+) -> tuple[DriveSide, ...]:
+    """Return what each axis' drive allows a design to use, and what it holds now.
+
+    Present parameters are those of ``parameters-before.yaml``; where they can not be read, the
+    axis' side says why.
+
+    Parameters
+    ----------
+    folder
+        Session folder.
+    machine
+        Its machine profile.
+    cycle
+        s, from one cyclic target to the next; None: that of the recording.
+    """
+    kept = _kept(folder, machine)
+    sampled = _sample_period(folder.recording) if cycle is None else cycle
+    return tuple(_side(axis, machine, kept[axis.name], sampled) for axis in machine.axes)
+
+
+def _side(axis: AxisProfile, machine: MachineProfile, kept: _Kept, cycle: float) -> DriveSide:
+    profile = profile_of(axis, machine)
+    resolution = nan
+    if axis.feed is not None and isfinite(kept.counts_per_rev):
+        resolution = axis.feed / kept.counts_per_rev
+    elif axis.kind == "rotary" and isfinite(kept.counts_per_rev):
+        resolution = 2 * pi / kept.counts_per_rev
+    conversion = _conversion(axis, profile, kept)
+    present, why = _present(axis, profile, conversion, kept)
+    return DriveSide(
+        axis.name,
+        profile.tunable,
+        timing_of(profile, cycle),
+        axis.limits.torque,
+        resolution,
+        _holds(profile, conversion, present or {}),
+        present,
+        why,
+    )
+
+
+def _kept(folder: SessionFolder, machine: MachineProfile) -> dict[str, _Kept]:
+    backups: dict[str, DriveBackup] = {}
+    why = ""
+    try:
+        backups = {d.axis: d for d in load_backup(folder.parameters_before).drives}
+    except (ProfileError, OSError) as error:
+        why = f"{error}"
+        if not folder.parameters_before.is_file():
+            why = f"there is no {folder.parameters_before.name} in the session folder."
+    numbers = _axes_of(folder.recording)
+    out = {}
+    for axis in machine.axes:
+        rated, counts = numbers.get(axis.name, (nan, nan))
+        backup = backups.get(axis.name)
+        lacking = why or f"{folder.parameters_before.name} has nothing of this axis."
+        if axis.encoder_counts_per_rev is not None and not isfinite(counts):
+            counts = float(axis.encoder_counts_per_rev)
+        if backup is not None and not isfinite(counts):
+            counts = float(_held(backup, ObjectAddress(0x608F, 1)) or nan)
+        out[axis.name] = _Kept(backup, "" if backup else lacking, rated, counts)
+    return out
+
+
+def _held(backup: DriveBackup, address: ObjectAddress) -> float | None:
+    for one in backup.held:
+        if one.info.address == address and not isinstance(one.value, str):
+            return float(one.value)
+    return None
+
+
+def _axes_of(recording: Path) -> dict[str, tuple[float, float]]:
+    """Return rated torque and counts a revolution of each axis, as a recording keeps them."""
+    try:
+        with h5py.File(recording, "r") as file:
+            return {
+                str(group.attrs.get("name", key)): (
+                    float(group.attrs.get("rated_torque", nan)),
+                    float(group.attrs.get("encoder_counts_per_rev", nan)),
+                )
+                for key, group in file["axes"].items()
+            }
+    except (OSError, KeyError, ValueError, TypeError):
+        return {}
+
+
+def _sample_period(recording: Path) -> float:
+    try:
+        with h5py.File(recording, "r") as file:
+            return float(file.attrs["sample_period"])
+    except (OSError, KeyError, ValueError, TypeError):
+        return 0.0
+
+
+def _conversion(axis: AxisProfile, profile: DriveProfile, kept: _Kept) -> Conversion:
+    quantities: dict[str, float] = {}
+    if isfinite(kept.rated_torque):
+        quantities["rated_torque"] = kept.rated_torque
+    if isfinite(kept.counts_per_rev):
+        quantities["counts_per_rev"] = kept.counts_per_rev
+    for name, quantity in profile.quantities.items():
+        value = None if kept.backup is None else _held(kept.backup, quantity.object)
+        if value is not None and quantity.scale != UNKNOWN:
+            quantities[name] = value * float(quantity.scale)
+    return Conversion(axis.name, profile, quantities)
+
+
+def _present(
+    axis: AxisProfile, profile: DriveProfile, conversion: Conversion, kept: _Kept
+) -> tuple[dict[str, float] | None, str]:
+    """Return what the drive holds now, or why nobody knows."""
+    given = dict(axis.loop.model_dump()) if axis.loop is not None else None
+    if kept.backup is None:
+        return given, "" if given else kept.why_not
+    values: dict[str, float] = {}
+    try:
+        for name, parameter in profile.parameters.items():
+            raw = _held(kept.backup, parameter.object)
+            if raw is not None and conversion.understood(name):
+                values[name] = conversion.physical(name, raw, values)
+        values = conversion.as_cascade(values)
+    except NotSupportedError as error:
+        return given, "" if given else str(error)
+    if any(name not in values for name in GAINS):
+        lacking = ", ".join(name for name in GAINS if name not in values)
+        why = (
+            f"{lacking} can not be read in SI units (drive profile {profile.name}); give them as `loop` at "
+            "the axis in the machine profile."
+        )
+        return (values | given if given else None), "" if given else why
+    return values, ""
+
+
+def _holds(
+    profile: DriveProfile, conversion: Conversion, present: Mapping[str, float]
+) -> dict[str, Hold]:
+    """Return how the drive holds each parameter whose unit is known."""
+    holds = {}
+    others = dict(present)
+    for name, parameter in profile.parameters.items():
+        if not conversion.understood(name) or parameter.told_type == UNKNOWN:
+            continue
+        missing = [o for o in parameter.times if o not in others and o not in conversion.quantities]
+        if missing:
+            continue
+        scale = conversion.physical(name, 1, others)
+        if not (isfinite(scale) and scale > 0):
+            continue
+        whole = not parameter.type.startswith("REAL")
+        if whole:
+            low, high = (float(n) for n in type_range(parameter.type))
+        else:
+            high = REAL_LARGEST[parameter.type]
+            low = -high
+        holds[name] = Hold(
+            scale,
+            parameter.power,
+            whole,
+            low,
+            high,
+            -inf if parameter.minimum is None else parameter.minimum,
+            inf if parameter.maximum is None else parameter.maximum,
+        )
+    return holds
