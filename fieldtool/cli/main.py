@@ -35,6 +35,7 @@ from fieldtool import workflow
 from fieldtool.cli.bus_options import Bitrate, Channel, Interface, on_bus
 from fieldtool.cli.check import check
 from fieldtool.cli.criticise import criticise
+from fieldtool.cli.design import design
 from fieldtool.cli.distinguish import ToDistinguish, tell_apart
 from fieldtool.cli.output import Json, console_of, print_json
 from fieldtool.cli.profile import profile_app
@@ -403,21 +404,6 @@ def compare(
 
 
 @app.command()
-def design(folder: Annotated[Path, typer.Argument(help="Session folder.")]) -> None:
-    """Design controller parameters from the session folder's model."""
-    tuning = workflow.redesign(folder)
-    console = console_of(False)
-    for axis in tuning.axes:
-        console.print(
-            f"{axis.axis}: {axis.reason} Peak of sensitivity {axis.sensitivity_peak:.2f} (2 or less is "
-            "good)."
-        )
-        for name, value in axis.parameters.items():
-            console.print(f"  {name:22}{value:.6g}")
-    console.print(f"Kept in {folder}; `fieldtool write {folder}` brings it into the drives.")
-
-
-@app.command()
 def write(
     folder: Annotated[Path, typer.Argument(help="Session folder with a tuning.")],
     yes: Yes = False,
@@ -512,6 +498,7 @@ app.add_typer(profile_app, name="profile")
 app.command()(check)
 app.command("replay")(replay_command)
 app.command()(criticise)
+app.command()(design)
 app.command()(report)
 app.command()(simulate)
 

@@ -12,6 +12,7 @@ from rich.progress import Progress as Bar
 from rich.table import Table
 from rich.text import Text
 
+from fieldtool.cli.design import show_tuning
 from fieldtool.design.tuning import Tuning
 from fieldtool.experiment.forecast import AxisForecast
 from fieldtool.experiment.multisine.runner import MultisineProgress
@@ -186,8 +187,7 @@ class TerminalScreen:
 
     def designed(self, tuning: Tuning) -> None:
         """Show why the new parameters are what they are."""
-        for axis in tuning.axes:
-            self.console.print(Text(f"  {axis.axis}: {axis.reason}"))
+        show_tuning(self.console, tuning)
 
     def _close(self) -> None:
         if self._bar is not None:

@@ -9,8 +9,9 @@ and the sensitivity of another axis i, whose loop stays as it is, follows from a
     S_i = 1 - C_i ( T_ii - T_ik C T_ki S )
 
 T being the compliance with this loop open; what the others' moves do follows in the same way, and is
-part of the cost: a stiff motor leaves the machine's vibrations to its neighbours.  All models that the design has to hold for are evaluated
-at once, as are all frequencies.
+part of the cost: a stiff motor leaves the machine's vibrations to its neighbours.
+
+All models that the design has to hold for are evaluated at once, as are all frequencies.
 """
 
 from collections.abc import Sequence
@@ -41,8 +42,8 @@ STIFFNESS = 0.025
 """Cost of the logarithm of what a disturbance leaves, in durations of the move."""
 INNER_BAND = 0.7
 """Of the band: where the search wants an axis to be, so that it is in the band for sure."""
-PUSHED = 0.5
-"""Weight of a disturbance beside the move."""
+MOVED, PUSHED = 2.0, 0.3
+"""Weights of the axis' move and of a disturbance."""
 DURING = 0.02
 """Weight of the following error before the move has ended, for the feed-forward."""
 MOST_FED = np.array([1.0, 1.3])
@@ -282,7 +283,8 @@ class AxisProblem:
         total = 0.0
         for plant, error in zip(self._plants, errors, strict=True):
             pushed = wave.signal(plant * disturbed)
-            total += _outside(error[self._begin :], band) + PUSHED * _outside(pushed, band)
+            total += MOVED * _outside(error[self._begin :], band)
+            total += PUSHED * _outside(pushed, band)
             energy = float(pushed @ pushed) * self._tick / band**2
             total += STIFFNESS * self.move.duration / self._tick * float(np.log(energy + 1e-12))
         follow = gain * sensitivity

@@ -98,7 +98,7 @@ def design(
     prediction = _predicted(task, chosen)
     if present is not None:
         chosen, prediction, kept = _not_worse(task, chosen, prediction, present)
-    return _tuning(task, response, bound, chosen, prediction, present, kept)
+    return _tuning(task, response, chosen, prediction, present, kept)
 
 
 def _rounded(task: Task) -> tuple[Servo, ...]:
@@ -131,8 +131,8 @@ def _rounded(task: Task) -> tuple[Servo, ...]:
     )
     raise DesignError(
         f"{task.sides[k].axis}: with the numbers that the drive can hold, the peak of sensitivity is "
-        f"{peaks[k]:.3g}, above {task.bound:.3g}; {why}. Nothing is written. Choose other units or ranges "
-        "in the drive, allow more with --bound, or enter gains by hand."
+        f"{peaks[k]:.3g}, above {task.bound:.3g}; {why}. Nothing is written. Choose other units or "
+        "ranges in the drive, allow more with --bound, or enter gains by hand."
     )
 
 
@@ -206,7 +206,6 @@ def _slower(new: AxisPrediction, was: AxisPrediction) -> bool:
 def _tuning(
     task: Task,
     response: str,
-    bound: float,
     servos: tuple[Servo, ...],
     prediction: Prediction,
     present: tuple[Servo, ...] | None,
@@ -220,6 +219,12 @@ def _tuning(
             parameters = {n: v for n, v in side.present.items() if n in parameters}
         reason = kept.get(k) or _reason(task, k, servo)
         axes.append(AxisTuning(side.axis, parameters, axis.margins.sensitivity_peak, reason))
+        if side.missing:
+            notes.append(
+                f"{side.axis}: its drive profile has no {', '.join(side.missing)} that can be written; "
+                "enter the numbers with the maker's software, or complete `parameters` in a drive "
+                "profile of your own."
+            )
         if side.unreadable:
             notes.append(
                 f"{side.axis}: its present parameters can not be compared: {side.unreadable}"

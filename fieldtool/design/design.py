@@ -20,7 +20,7 @@ from fieldtool.design.drive_side import PID, DriveSide
 from fieldtool.design.loops import system_matrix
 from fieldtool.design.machine import Machine, machine_of
 from fieldtool.design.moves import TestMove, typical_move
-from fieldtool.design.robust import check, fresh_check, machines_for, stable_on_all
+from fieldtool.design.robust import FRESH, MAY_FAIL, check, fresh_check, machines_for, stable_on_all
 from fieldtool.design.rule import DesignError, rule
 from fieldtool.design.search import Best, Space, again, search
 from fieldtool.design.servo import Servo
@@ -37,7 +37,7 @@ INSIDE = 0.985
 """Of the bound: what the search keeps, so that rounding does not leave it."""
 AGAIN, REPAIRED = 140, 100
 """Evaluations an axis in the second round, and after machines were added."""
-LOWERED, MOST_LOWERED = 0.9, 20
+LOWERED, MOST_LOWERED = 0.85, 12
 SAMPLES = 1024
 ROUNDS = 2
 Advance = Callable[[str, float], None]
@@ -96,15 +96,8 @@ def find(
     Raises
     ------
     DesignError
-        If a drive has no gains to set, or nothing keeps the margin on all likely machines.
+        If nothing keeps the margin on all likely machines.
     """
-    for side in sides:
-        if side.missing:
-            raise DesignError(
-                f"{side.axis}: its drive profile has no {', '.join(side.missing)} that can be written, "
-                "so there is nothing to design; nothing is written. Complete `parameters` in a drive "
-                "profile of your own, or enter gains with the maker's software."
-            )
     rng = np.random.default_rng(seed)
     machines = machines_for(model, rng)
     modes = np.concatenate([machines[0].modes, machines[0].held_modes])
@@ -129,7 +122,6 @@ def _start(task: Task) -> None:
     """Put in controllers that are stable on every machine."""
     modes = np.concatenate([task.machines[0].modes, task.machines[0].held_modes])
     lowest = 0.3 * float(modes.min()) if modes.size else 2 * np.pi
-    servos = []
     for loop, axis, side in zip(rule(task.model), task.model.axes, task.sides, strict=True):
         highest = 0.8 * np.pi / (side.timing.period or 1e-4)
         space = Space(side, axis.total_mass, (), lowest, min(highest, 30 * task.top))
@@ -137,7 +129,7 @@ def _start(task: Task) -> None:
         whole = all(name in side.holds for name in PID)
         share = 1.0 if side.has("velocity_ff") or whole else present.get("velocity_ff", 0.0)
         inertia = axis.total_mass if side.has("inertia_ff") else present.get("inertia_ff", 0.0)
-        loop = replace(loop, velocity_ff=share, inertia_ff=inertia)
+        fed = replace(loop, velocity_ff=share, inertia_ff=inertia)
         servo = side.servo(
             {"position_p": 1.0, "velocity_p": 1.0, "velocity_i": 1.0}
             | {f"filter{k}_type": 0.0 for k in side.filters}
@@ -146,7 +138,7 @@ def _start(task: Task) -> None:
         if side.has("velocity_filter"):
             corner = space.highest / (2 * np.pi)
         kept = servo.loop.filters  # of a drive whose filters can not be set
-        servo = Servo(replace(loop, filters=kept), corner, side.timing)
+        servo = Servo(replace(fed, filters=kept), corner, side.timing)
         task.found.append(Best(space, servo, inf))
     for _ in range(MOST_LOWERED):
         if stable_on_all(task.machines, task.servos):
@@ -158,12 +150,10 @@ def _start(task: Task) -> None:
             "nothing is written. Measure longer (--time), or give the number of masses with `fieldtool "
             "identify FOLDER --masses AXIS=N`."
         )
-    present = [side.present_servo for side in task.sides]
-    if all(servo is not None for servo in present):
-        whole = tuple(servo for servo in present if servo is not None)
-        same = all(not s.loop.filters for s in whole)
-        if same and np.all(check(task.machines, whole).peaks <= task.bound):
-            _take_better(task, whole)
+    known = tuple(now for side in task.sides if (now := side.present_servo) is not None)
+    plain = len(known) == len(task.sides) and not any(now.loop.filters for now in known)
+    if plain and np.all(check(task.machines, known).peaks <= task.bound):
+        _take_better(task, known)
 
 
 def _take_better(task: Task, present: tuple[Servo, ...]) -> None:
@@ -220,10 +210,11 @@ def _one(task: Task, axis: int, bound: float, *, first: bool, evaluations: int =
     problem = _problem(task, _grids(task), task.servos, axis, bound)
     best = task.found[axis]
     best = replace(best, cost=problem.cost(best.servo))
-    if first:
-        found = search(problem, best, task.machines[0].modes)
-    else:
-        found = again(problem, best, evaluations)
+    found = (
+        search(problem, best, task.machines[0].modes)
+        if first
+        else again(problem, best, evaluations)
+    )
     tried = [*task.servos]
     tried[axis] = found.servo
     if stable_on_all(task.machines, tuple(tried)):  # what the grid did not see
@@ -248,15 +239,17 @@ def _hold_for_others(task: Task) -> None:
             task.found = [replace(b, servo=slower(b.servo)) for b in task.found]
         for axis in _order(task):
             _one(task, axis, INSIDE * task.bound, first=False, evaluations=REPAIRED)
+    checked = fresh_check(task.model, task.servos, task.rng)
     for _ in range(MOST_LOWERED):
-        checked = fresh_check(task.model, task.servos, task.rng)
         missed = checked.missed(task.bound)
-        if not np.any(missed > 0.05):
+        if not np.any(missed > MAY_FAIL):
             return
+        task.advance("lower the gains", 0.92)
         task.found = [
             replace(best, servo=slower(best.servo)) if missed[k] > 0 else best
             for k, best in enumerate(task.found)
         ]
+        checked = check(checked.worst(FRESH), task.servos)
     raise DesignError(
         "the model's uncertainty does not allow the margin: on some machines that it allows, the peak "
         f"of sensitivity stays above {task.bound:.3g} whatever the gains; nothing is written. Measure "

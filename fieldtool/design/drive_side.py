@@ -9,6 +9,7 @@ from fieldtool.design.servo import Servo, Timing, servo_from_parameters
 GAINS = ("position_p", "velocity_p", "velocity_i")
 PID = ("pid_p", "pid_i", "pid_d")
 FILTERS = (1, 2)
+CAUTIOUS = Timing()
 
 
 @dataclass(frozen=True)
@@ -55,7 +56,7 @@ class DriveSide:
     axis: str
     tunable: frozenset[str] | None = None
     """Names of the parameters that the drive has; None: every one that a design can want."""
-    timing: Timing = Timing()
+    timing: Timing = CAUTIOUS
     torque_limit: float = inf
     """N m or N."""
     resolution: float = nan
@@ -79,7 +80,7 @@ class DriveSide:
 
     @property
     def missing(self) -> tuple[str, ...]:
-        """Gains without which nothing can be designed."""
+        """Gains that a design has and the drive can not be told: for a person to enter."""
         return tuple(name for name in GAINS if not self.has(name))
 
     def held(self, parameters: Mapping[str, float]) -> dict[str, float]:
@@ -96,6 +97,9 @@ class DriveSide:
         kp, kv, ki = (parameters[name] for name in GAINS)
         wanted = dict(zip(PID, (kv * kp + ki, ki * kp, kv), strict=True))
         p, i, d = (self.holds[name].nearest(value) for name, value in wanted.items())
+        hold = self.holds["pid_i"]
+        while i > 0 and p * p < 4 * i * d:  # no cascade is that: less integral is one
+            i = max(hold.nearest(min(i - hold.scale, 0.999 * i)), 0.0)
         root = max(p * p - 4 * i * d, 0.0) ** 0.5
         larger = (p + root) / 2
         return rounded | dict(zip(GAINS, (larger / d, d, p - larger), strict=True))

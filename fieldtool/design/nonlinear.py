@@ -29,9 +29,9 @@ def notes_of(model: MachineModel, servos: Sequence[Servo]) -> list[str]:
         elif kind == "backlash":
             gap = number(effect, "gap") or 2 * number(effect, "half_gap")
             notes.append(
-                f"{name}: the backlash of {gap:.3g} {unit} makes the last mass uncertain by as much, and "
-                "small oscillations about a target are possible; the margin was kept with a softened "
-                "joint as well."
+                f"{name}: the backlash of {gap:.3g} {unit} makes the last mass uncertain by as "
+                "much, and small oscillations about a target are possible; the margin was kept "
+                "with a softened joint as well."
             )
         elif kind == "measurement_delay" and number(effect, "delay") > 0:
             notes.append(
@@ -56,7 +56,7 @@ def _friction(name: str, effect: Mapping[str, Any], servo: Servo, unit: str) -> 
     if loop.velocity_i <= 0:
         return [f"{name}: dry friction may hold the motor up to {away:.3g} {unit} off its target."]
     return [
-        f"{name}: dry friction of {torque:.3g} may hold the motor up to {away:.3g} {unit} off its target "
-        f"for about {loop.velocity_p / loop.velocity_i:.2g} s, and then let it creep or hunt; settling "
-        "will take longer than predicted where the band is smaller than that."
+        f"{name}: dry friction of {torque:.3g} may hold the motor up to {away:.3g} {unit} off its "
+        f"target for about {loop.velocity_p / loop.velocity_i:.2g} s, and then let it creep or hunt; "
+        "settling will take longer than predicted where the band is smaller than that."
     ]

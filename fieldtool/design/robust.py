@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -64,8 +65,8 @@ def _traits(machine: Machine) -> FloatArray:
     """Return the logarithms of modes and of the inertia that each motor has to move."""
     total = np.diag(machine.mass)
     bounds = [*machine.motors.tolist(), machine.mass.shape[0]]
-    inertia = [total[a:b].sum() for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
-    return np.log(np.concatenate([machine.modes, machine.held_modes, inertia]))
+    inertia = [total[a:b].sum() for a, b in pairwise(bounds)]
+    return np.asarray(np.log(np.concatenate([machine.modes, machine.held_modes, inertia])))
 
 
 def stable_on_all(machines: Sequence[Machine], servos: tuple[Servo, ...]) -> bool:

@@ -179,7 +179,20 @@ def search(problem: AxisProblem, start: Best, resonances: FloatArray) -> Best:
         if better.cost > WORTH * best.cost:
             break
         best = better
-    return improve(problem, best, LAST, 0.5 * SPREAD)
+    return _pruned(problem, improve(problem, best, LAST, 0.5 * SPREAD))
+
+
+def _pruned(problem: AxisProblem, best: Best) -> Best:
+    """Leave out the filters that bring nothing."""
+    for k in reversed(range(len(best.space.slots))):
+        slots, filters = list(best.space.slots), list(best.servo.loop.filters)
+        del slots[k], filters[k]
+        loop = replace(best.servo.loop, filters=tuple(filters))
+        servo = problem.fed_forward(replace(best.servo, loop=loop))
+        cost = problem.cost(servo)
+        if cost <= best.cost + (1 - WORTH) * abs(best.cost):
+            best = Best(replace(best.space, slots=tuple(slots)), servo, cost)
+    return best
 
 
 def again(problem: AxisProblem, best: Best, evaluations: int) -> Best:
@@ -199,12 +212,13 @@ def _scaled(
             if not itself and outer == inner == 1.0:
                 continue
             loop = start.servo.loop
-            gains = {
-                "position_p": loop.position_p * outer,
-                "velocity_p": loop.velocity_p * inner,
-                "velocity_i": loop.velocity_i * outer * inner,
-            }
-            servo = replace(start.servo, loop=replace(loop, **gains))
+            scaled = replace(
+                loop,
+                position_p=loop.position_p * outer,
+                velocity_p=loop.velocity_p * inner,
+                velocity_i=loop.velocity_i * outer * inner,
+            )
+            servo = replace(start.servo, loop=scaled)
             servo = start.space.servo(start.space.vector(servo), servo)
             cost = problem.cost(servo)
             if cost < best.cost:
@@ -233,5 +247,5 @@ def _added(problem: AxisProblem, best: Best, kind: str, w: float) -> Best:
 
 
 def _directions(size: int) -> FloatArray:
-    """Return one step along each axis, alternating in sign so that the simplex is not all on one side."""
+    """Return one step along each axis, alternating in sign: a simplex around its start."""
     return np.diag(np.where(np.arange(size) % 2 == 0, 1.0, -1.0))

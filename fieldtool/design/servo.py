@@ -42,6 +42,10 @@ class Timing:
     is followed at once."""
 
 
+AT_ONCE = Timing(0.0, 0.0)
+"""Loops without any delay."""
+
+
 @dataclass(frozen=True)
 class Servo:
     """One axis' controller in its drive, SI."""
@@ -49,7 +53,7 @@ class Servo:
     loop: AxisLoop
     velocity_filter: float = OFF
     """First-order low-pass on the measured velocity, Hz; infinite: none."""
-    timing: Timing = Timing(0.0, 0.0)
+    timing: Timing = AT_ONCE
 
     def gain(self, s: ComplexArray) -> ComplexArray:
         """Return torque per position error of the standing reference, shape of ``s``, rad/s."""

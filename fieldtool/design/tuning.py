@@ -6,7 +6,7 @@ from math import sqrt
 
 import numpy as np
 
-from fieldtool.design.drive_side import FILTERS, DriveSide
+from fieldtool.design.drive_side import FILTERS, GAINS, DriveSide
 from fieldtool.design.moves import TestMove
 from fieldtool.design.predict import Prediction
 from fieldtool.design.servo import OFF, Servo
@@ -14,7 +14,7 @@ from fieldtool.design.shaping import Shaping
 from fieldtool.records.closed_loop import Biquad
 
 RESPONSES: Mapping[str, float] = {"soft": 0.4, "normal": 0.7, "stiff": 1.0}
-"""A technician's choices: the part of the room between 1 and the bound that the peak of sensitivity uses."""
+"""A technician's choices: how much of the room between 1 and the bound the peak of sensitivity uses."""
 BOUND = 2.0
 """Peak of sensitivity that no axis may exceed: 6 dB."""
 
@@ -67,6 +67,8 @@ class Tuning:
 def as_parameters(servo: Servo, side: DriveSide | None = None) -> dict[str, float]:
     """Return a controller as parameters by name, of those that a drive has; filters not used are off.
 
+    The cascade's gains are always there: where the drive can not be told, a person enters them.
+
     Parameters
     ----------
     servo
@@ -86,7 +88,7 @@ def as_parameters(servo: Servo, side: DriveSide | None = None) -> dict[str, floa
     if servo.velocity_filter != OFF:
         parameters["velocity_filter"] = servo.velocity_filter
     parameters |= _filters(loop.filters, side.filters or FILTERS)
-    return {name: value for name, value in parameters.items() if side.has(name)}
+    return {n: value for n, value in parameters.items() if n in GAINS or side.has(n)}
 
 
 def _filters(biquads: Sequence[Biquad], places: Sequence[int]) -> dict[str, float]:

@@ -6,6 +6,7 @@ simulation may stand behind the bus.
 
 from fieldtool.workflow.checking import CheckResult, check
 from fieldtool.workflow.criticising import criticise_source as criticise
+from fieldtool.workflow.designing import redesign
 from fieldtool.workflow.distinguishing import Distinguished, distinguish
 from fieldtool.workflow.fast_measuring import plan
 from fieldtool.workflow.models import prior_model, truth_model
@@ -19,7 +20,7 @@ from fieldtool.workflow.session import (
     SessionResult,
     parameter_table,
 )
-from fieldtool.workflow.stages import draw, identify, measure, redesign, restore, run, write
+from fieldtool.workflow.stages import draw, identify, measure, restore, run, write
 from fieldtool.workflow.twin import Twin, twin
 
 __all__ = [

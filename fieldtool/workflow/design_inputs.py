@@ -207,8 +207,8 @@ def _present(
     if any(name not in values for name in GAINS):
         lacking = ", ".join(name for name in GAINS if name not in values)
         why = (
-            f"{lacking} can not be read in SI units (drive profile {profile.name}); give them as `loop` at "
-            "the axis in the machine profile."
+            f"{lacking} can not be read in SI units (drive profile {profile.name}); give them as `loop` "
+            "at the axis in the machine profile."
         )
         return (values | given if given else None), "" if given else why
     return values, ""

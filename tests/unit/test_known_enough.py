@@ -6,7 +6,7 @@ import pytest
 
 from fieldtool.errors import IdentificationError
 from fieldtool.records.model import AxisModel, Estimate, MachineModel
-from fieldtool.workflow.stages import check_known
+from fieldtool.workflow.designing import check_known
 
 KNOWN = AxisModel(
     "table", "rotary", (Estimate(0.02, 1e-4), Estimate(0.03, 2e-4)), (Estimate(190, 1.0),), ()

@@ -1,6 +1,5 @@
 """What is shown fits the terminal, loses no digit, and never fails on a name."""
 
-from dataclasses import replace
 from io import StringIO
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,7 +9,7 @@ import pytest
 from rich.console import Console
 
 from fieldtool.cli.screen import TerminalScreen, model_table, parameter_rows, show_result
-from fieldtool.design.tuning import design
+from fieldtool.design.tuning import AxisTuning, Tuning
 from fieldtool.experiment.forecast import AxisForecast
 from fieldtool.experiment.stepped.plan import Sweep, SweepPlan, tone_near
 from fieldtool.experiment.stepped.runner import Progress
@@ -186,10 +185,10 @@ def test_a_result_on_the_screen(folder: str) -> None:
     found = model()
     write_back = WriteBack((), (), in_memory=False, stored=False, backup=None)
     identified: Any = SimpleNamespace(notes=())
+    tuning = Tuning((AxisTuning("axis1", {"velocity_p": 4.2}, 1.5, "total inertia 5"),))
     result = SessionResult(
-        Path(folder), found, identified, design(replace(found, couplings=())), write_back, found,
-        754.0, 61.5, (),
-    )  # fmt: skip
+        Path(folder), found, identified, tuning, write_back, found, 754.0, 61.5, ()
+    )
     out = console(200)
     show_result(out, result)
     assert f"Everything is in {folder}" in text(out)

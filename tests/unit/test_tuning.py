@@ -1,4 +1,4 @@
-"""The design rule by hand, and its margins by a Nyquist computation of its own."""
+"""The rule that a design begins with, by hand, and its margins by a Nyquist computation of its own."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -7,8 +7,14 @@ import numpy as np
 import pytest
 from scipy.linalg import eigh
 
-from fieldtool.design.rule import DesignError, lowest_antiresonance, sensitivity_peak
-from fieldtool.design.tuning import as_parameters, design
+from fieldtool.design.rule import (
+    DesignError,
+    lowest_antiresonance,
+    rule_with_notches,
+    sensitivity_peak,
+)
+from fieldtool.design.servo import Servo
+from fieldtool.design.tuning import AxisTuning, as_parameters
 from fieldtool.records.closed_loop import AxisLoop, ClosedLoop, loop_from_parameters
 from fieldtool.records.model import AxisModel, Coupling, Estimate, MachineModel
 
@@ -30,11 +36,19 @@ def axis(
     )
 
 
+def ruled(model: MachineModel) -> list[AxisTuning]:
+    loops = rule_with_notches(model)
+    return [
+        AxisTuning(a.name, as_parameters(Servo(loop)), sensitivity_peak(model, loops, k), "rule")
+        for k, (a, loop) in enumerate(zip(model.axes, loops, strict=True))
+    ]
+
+
 def test_the_rule_by_hand_for_two_masses() -> None:
     """J = 5; w_a = sqrt(1200 / 3) = 20 rad/s; w_v = 14 rad/s; the notch at sqrt(1200 / 2 + 1200 / 3)."""
     model = MachineModel((axis((2.0, 3.0), (1200.0,), (2.0,)),))
     assert lowest_antiresonance(model.axes[0]) == pytest.approx(20.0)
-    (tuned,) = design(model).axes
+    (tuned,) = ruled(model)
     found = dict(tuned.parameters)
     lowered = found["velocity_p"] / (5 * 14)
     steps = np.log(lowered) / np.log(0.85)
@@ -48,14 +62,12 @@ def test_the_rule_by_hand_for_two_masses() -> None:
         assert found["filter1_frequency"] == pytest.approx(np.sqrt(1000) / (2 * np.pi))
         assert found["filter1_zero_damping"] == pytest.approx(0.1)
         assert found["filter1_pole_damping"] == pytest.approx(0.5)
-    assert "total inertia 5," in tuned.reason
-    assert "lowest antiresonance 3.18 Hz" in tuned.reason
 
 
 def test_a_well_damped_stiff_axis_needs_no_lowering() -> None:
     """Load much lighter than the motor: the rule's numbers stand as they are."""
     model = MachineModel((axis((10.0, 0.1), (90.0,), (1.0,)),))
-    (tuned,) = design(model).axes
+    (tuned,) = ruled(model)
     w = 0.7 * 30
     assert tuned.parameters["velocity_p"] == pytest.approx(10.1 * w)
     assert tuned.parameters["velocity_i"] == pytest.approx(10.1 * w * w / 4)
@@ -65,7 +77,7 @@ def test_a_well_damped_stiff_axis_needs_no_lowering() -> None:
 @pytest.mark.parametrize("stiff", [None, 1e9])
 def test_a_rigid_or_very_stiff_axis_takes_the_fixed_bandwidth(stiff: float | None) -> None:
     one = axis((3.0,), (), ()) if stiff is None else axis((1.5, 1.5), (stiff,), (50.0,))
-    (tuned,) = design(MachineModel((one,))).axes
+    (tuned,) = ruled(MachineModel((one,)))
     w = 2 * np.pi * 8
     assert tuned.parameters["velocity_p"] == pytest.approx(3 * w)
     assert tuned.parameters["position_p"] == pytest.approx(w / 4)
@@ -112,11 +124,11 @@ def test_margins_of_random_machines(
     lengths: tuple[int, ...], random_model: RandomModel, fresh_rng: np.random.Generator
 ) -> None:
     model = random_model(fresh_rng, lengths, friction=bool(fresh_rng.integers(0, 2)))
-    tuning = design(model)
-    loops = [loop_from_parameters(one.parameters) for one in tuning.axes]
+    tuning = ruled(model)
+    loops = [loop_from_parameters(one.parameters) for one in tuning]
     closed = ClosedLoop(model, tuple(loops))
     assert np.linalg.eigvals(closed.system_matrix()).real.max() < 0
-    for k, tuned in enumerate(tuning.axes):
+    for k, tuned in enumerate(tuning):
         distance = nyquist_distance(model, loops, k)
         assert 1 / distance <= 2.0 * 1.01
         assert tuned.sensitivity_peak == pytest.approx(1 / distance, rel=0.03)
@@ -138,7 +150,7 @@ def test_the_bound_holds_where_it_matters(
     model = random_model(np.random.default_rng(seed), lengths, spread=1.0)
 
     def worst() -> float:
-        loops = [loop_from_parameters(one.parameters) for one in design(model).axes]
+        loops = [loop_from_parameters(one.parameters) for one in ruled(model)]
         return max(1 / nyquist_distance(model, loops, k) for k in range(len(loops)))
 
     assert worst() <= 2.0 * 1.01
@@ -162,10 +174,10 @@ def test_the_peak_is_found_far_below_the_modes(fast: float) -> None:
 
 def test_a_rigid_axis_beside_an_elastic_one_gets_no_notch() -> None:
     model = MachineModel((axis((3.0,), (), ()), axis((2.0, 1.0), (900.0,), (1.0,), "y")))
-    rigid, elastic = design(model).axes
+    rigid, elastic = ruled(model)
     assert rigid.parameters["filter1_type"] == 0.0
     assert rigid.parameters["velocity_p"] == pytest.approx(3 * 2 * np.pi * 8)
-    alone = design(MachineModel(model.axes[1:])).axes[0]
+    alone = ruled(MachineModel(model.axes[1:]))[0]
     assert dict(elastic.parameters) == pytest.approx(dict(alone.parameters))
 
 
@@ -178,14 +190,14 @@ def test_the_lowest_antiresonance_is_the_chain_with_its_motor_held() -> None:
 
 def test_parameters_are_the_loop_and_back() -> None:
     model = MachineModel((axis((2.0, 0.5), (5000.0,), (8.0,)),))
-    tuning = design(model)
-    for tuned in tuning.axes:
+    tuning = ruled(model)
+    for tuned in tuning:
         loop = loop_from_parameters(tuned.parameters)
-        again = as_parameters(loop)
+        again = as_parameters(Servo(loop))
         assert set(again) == set(tuned.parameters)
         for name, value in again.items():
             assert value == pytest.approx(tuned.parameters[name])
-    plain = as_parameters(AxisLoop(1.0, 2.0, 3.0))
+    plain = as_parameters(Servo(AxisLoop(1.0, 2.0, 3.0)))
     assert plain["filter1_type"] == plain["filter2_type"] == 0.0
     assert loop_from_parameters(plain) == AxisLoop(1.0, 2.0, 3.0, 1.0, 0.0)
 
@@ -197,11 +209,11 @@ def test_a_machine_that_nothing_can_hold_is_refused() -> None:
         (Coupling(("x", "y"), 1.5),),
     )
     with pytest.raises(DesignError, match="Check the model"):
-        design(model)
+        ruled(model)
     negative = replace(model, couplings=())
     negative = replace(
         negative,
         axes=(axis((1.0, 1.0), (500.0,), (-60.0,)), negative.axes[1]),
     )
     with pytest.raises(DesignError, match="nothing is written"):
-        design(negative)
+        ruled(negative)

@@ -1,0 +1,114 @@
+"""``fieldtool design``: new parameters from the model, and what they will do."""
+
+from collections.abc import Callable
+from math import isfinite, isnan
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from fieldtool import workflow
+from fieldtool.cli.criticise import SearchBar
+from fieldtool.cli.output import Json, console_of, print_json
+from fieldtool.design.predict import AxisPrediction
+from fieldtool.design.tuning import BOUND, RESPONSES, Tuning
+from fieldtool.design.tuning_file import tuning_as_dict
+
+Figure = Callable[[AxisPrediction], float | None]
+
+
+def _motor(name: str) -> Figure:
+    return lambda one: None if one.move is None else float(getattr(one.move, name))
+
+
+def _load(name: str) -> Figure:
+    return lambda one: None if one.load is None else float(getattr(one.load, name))
+
+
+ROWS: tuple[tuple[str, float, Figure], ...] = (
+    ("peak of sensitivity", 1, lambda one: one.margins.sensitivity_peak),
+    ("phase margin, degrees", 1, lambda one: one.margins.phase_margin),
+    ("delay margin, ms", 1e3, lambda one: one.margins.delay_margin),
+    ("bandwidth, Hz", 1, lambda one: one.margins.bandwidth),
+    ("move: following error", 1, _motor("following_error")),
+    ("move: overshoot", 1, _motor("overshoot")),
+    ("move: settling, s", 1, _motor("settling_time")),
+    ("last mass: settling, s", 1, _load("settling_time")),
+    ("last mass: vibration", 1, _load("residual_rms")),
+    ("move: torque", 1, lambda one: one.peak_torque),
+    ("step: settling, s", 1, lambda one: None if one.step is None else one.step.settling_time),
+    ("compliance", 1, lambda one: one.compliance),
+    ("noise of torque", 1, lambda one: one.noise),
+)
+"""Title, scale, figure."""
+
+
+def design(
+    folder: Annotated[Path, typer.Argument(help="Session folder.")],
+    response: Annotated[
+        str, typer.Option("--response", help=f"{', '.join(RESPONSES)}: how near to the bound.")
+    ] = "normal",
+    bound: Annotated[
+        float, typer.Option("--bound", help="Peak of sensitivity that no axis may exceed.")
+    ] = BOUND,
+    png: Annotated[
+        Path | None,
+        typer.Option("--png", help="Draw sensitivity, step, move and trade (FILE.png)."),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Design controller parameters from the session folder's model, and predict what they do."""
+    if response not in RESPONSES:
+        raise typer.BadParameter(f"--response is one of {', '.join(RESPONSES)}, got {response!r}")
+    if not (isfinite(bound) and bound > 1.1):
+        raise typer.BadParameter(f"--bound is a number above 1.1, got {bound:g}")
+    console = console_of(as_json)
+    with SearchBar(console) as bar:
+        tuning = workflow.redesign(folder, response, bound, png, bar)
+    show_tuning(console, tuning)
+    for axis in tuning.axes:
+        console.print(Text(f"{axis.axis}:"))
+        for name, value in axis.parameters.items():
+            console.print(Text(f"  {name:22}{value:.6g}"))
+    console.print(Text(f"Kept in {folder}; `fieldtool write {folder}` brings it into the drives."))
+    if as_json:
+        print_json(tuning_as_dict(tuning))
+
+
+def show_tuning(console: Console, tuning: Tuning) -> None:
+    """Show why, what is to be expected beside what is there now, and what to know."""
+    for axis in tuning.axes:
+        console.print(Text(f"  {axis.axis}: {axis.reason}"))
+    if tuning.prediction is not None:
+        console.print(_table(tuning))
+    for sentence in (*(one.sentence for one in tuning.shaping), *tuning.notes):
+        console.print(Text(f"  {sentence}"))
+
+
+def _table(tuning: Tuning) -> Table:
+    table = Table(box=None, padding=(0, 2))
+    table.add_column("predicted")
+    prediction = tuning.prediction
+    axes = prediction.axes if prediction is not None else ()
+    for axis in axes:
+        if tuning.present is not None:
+            table.add_column(f"{axis.axis} now", justify="right")
+            table.add_column("new", justify="right")
+        else:
+            table.add_column(axis.axis, justify="right")
+    for title, scale, of in ROWS:
+        row = [title]
+        for axis in axes:
+            pair = [tuning.present.of(axis.axis)] if tuning.present is not None else []
+            row += [_cell(of(one), scale) for one in (*pair, axis)]
+        table.add_row(*row)
+    return table
+
+
+def _cell(value: float | None, scale: float) -> str:
+    if value is None or isnan(value):
+        return "-"
+    return f"{scale * value:.3g}" if isfinite(value) else "does not"
