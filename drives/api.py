@@ -142,6 +142,16 @@ class MotionWatch(Protocol):
         """Take the sample of one SYNC, M values each, SI; return why the motion has to end, or None."""
 
 
+class Onlooker(Protocol):
+    """Takes what axes do block by block while they move; must neither wait nor raise."""
+
+    def begin(self, cycle_time: float) -> None:
+        """A motion begins."""
+
+    def take(self, capture: "Capture") -> None:
+        """A block of it."""
+
+
 class Drive(Protocol):
     """One axis' drive."""
 

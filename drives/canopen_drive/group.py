@@ -8,7 +8,7 @@ from pathlib import Path
 
 import can
 
-from drives.api import MotionWatch
+from drives.api import MotionWatch, Onlooker
 from drives.bus import CyclicLoad, check_cycle, open_bus, shortest_cycle
 from drives.canopen_drive import fail_safe, setup
 from drives.canopen_drive.drive import CanopenDrive
@@ -49,6 +49,8 @@ class CanopenGroup:
         self._drives, self._stop_requested = tuple(drives), stop_requested
         self.warnings: list[str] = []
         """What could not be put back, in words."""
+        self.onlooker: Onlooker | None = None
+        """Sees every block of all motions; none where it is None."""
         self.punctuality = Punctuality()
         """How well the host has kept the cycles of all motions so far."""
 
@@ -192,6 +194,9 @@ class CanopenGroup:
                 watch,
             )
             motion.perhaps_enabled = unsure
+            motion.onlooker = self.onlooker
+            if self.onlooker is not None:
+                self.onlooker.begin(cycle_time)
             motion.real_time = stack.enter_context(undisturbed(self.line.clock))
             stack.enter_context(self.line.only(_identifiers(self._drives)))
             self.line.begin_heartbeat(setup.HOST_NODE_ID, setup.HOST_HEARTBEAT)

@@ -12,7 +12,7 @@ import can
 import numpy as np
 
 from drives import objects
-from drives.api import Capture, FloatArray, MotionWatch, Source, Targets, joined
+from drives.api import Capture, FloatArray, MotionWatch, Onlooker, Source, Targets, joined
 from drives.canopen_drive.channel import INPUT, OUTPUT, Channel, channel_of
 from drives.canopen_drive.drive import CanopenDrive
 from drives.canopen_drive.interrupts import uninterrupted
@@ -85,6 +85,7 @@ class CanopenMotion:
         self._stopped = False
         self.perhaps_enabled: dict[str, str] = {}
         """Axes whose drive could not be seen to be off after a stop: a sentence each."""
+        self.onlooker: Onlooker | None = None
         self.real_time = ""
         """Why the host has no real-time priority; empty where it has."""
 
@@ -130,6 +131,8 @@ class CanopenMotion:
             previous: Capture | None = None
             while (block := source(previous)) is not None:
                 previous = self._follow(block, captures)
+                if self.onlooker is not None:
+                    self.onlooker.take(previous)
             self._release_offsets()
         except BaseException as error:
             self.stop(error)

@@ -76,6 +76,11 @@ class SessionFolder:
         return self.path / "recording.h5"
 
     @property
+    def raw_rows(self) -> Path:
+        """What axes did in a motion whose experiments are not in the recording."""
+        return self.path / "recording-cut-off.rows"
+
+    @property
     def frequency_response(self) -> Path:
         """Responses."""
         return self.path / "frequency-response.h5"

@@ -21,6 +21,7 @@ from fieldtool.report.criticism_picture import draw_criticism
 from fieldtool.workflow.models import prior_model
 from fieldtool.workflow.reporting import report as write_report
 from fieldtool.workflow.reporting import report_of_recording
+from fieldtool.workflow.rescued import rescue
 from fieldtool.workflow.session import Session
 
 Advance = Callable[[str, float], None]
@@ -58,6 +59,8 @@ def criticise_source(
         If the data do not allow it.
     """
     folder = SessionFolder(source) if source.is_dir() else None
+    if folder:
+        rescue(folder)
     recording = load(folder.recording if folder else source)
     prior = None
     if folder and folder.machine.is_file():

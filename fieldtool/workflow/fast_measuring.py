@@ -33,6 +33,7 @@ from fieldtool.workflow.planning import (
     usual_seconds,
 )
 from fieldtool.workflow.preparation import axes_of, recording_header, setting_of, window_notes
+from fieldtool.workflow.rescued import keeping
 from fieldtool.workflow.session import Options, Screen, Session
 from fieldtool.workflow.stopped import check_loops, judge_stop
 from fieldtool.writeback.temporary import backed_up
@@ -148,14 +149,10 @@ class FastMeasurement:
         """Measure with the pilot's cycle; None if this computer can not keep it."""
         session, group = self._session, self._group
         header = recording_header(session.machine, group, pilot.cycle_time, with_lengths=False)
-        with RecordingWriter(session.folder.recording, header) as recording:
-
-            def keep(experiment: Experiment) -> None:
-                recording.append(experiment)
-                session.folder.note(
-                    "recorded", experiment=experiment.name, complete=experiment.complete
-                )
-
+        with (
+            RecordingWriter(session.folder.recording, header) as recording,
+            keeping(session.folder, recording, group) as keep,
+        ):
             session.screen.stage("Check that every axis moves the right way")
             late = group.late_cycles
             check_directions(group, self._axes, pilot.cycle_time, keep)

@@ -19,9 +19,10 @@ from fieldtool.experiment.stepped.design import (
 from fieldtool.experiment.stepped.runner import run_plan
 from fieldtool.identify.classic import without_friction
 from fieldtool.identify.recorded import identify_recording
-from fieldtool.records.recording import Experiment, Recording, RecordingWriter
+from fieldtool.records.recording import Recording, RecordingWriter
 from fieldtool.workflow.models import check_believable, prior_model
 from fieldtool.workflow.preparation import axes_of, recording_header, setting_of, window_notes
+from fieldtool.workflow.rescued import keeping
 from fieldtool.workflow.session import Session
 from fieldtool.writeback.temporary import backed_up
 
@@ -51,14 +52,11 @@ def _measure_both_passes(session: Session, group: CanopenGroup) -> float:
     if not session.ready():
         raise UserStopError("not begun: nothing was moved")
     axes = axes_of(group, setting)
-    with RecordingWriter(
-        folder.recording, recording_header(machine, group, cycle_time, with_lengths=True)
-    ) as recording:
-
-        def keep(experiment: Experiment) -> None:
-            recording.append(experiment)
-            folder.note("recorded", experiment=experiment.name, complete=experiment.complete)
-
+    header = recording_header(machine, group, cycle_time, with_lengths=True)
+    with (
+        RecordingWriter(folder.recording, header) as recording,
+        keeping(folder, recording, group) as keep,
+    ):
         screen.stage("Check that every axis moves the right way")
         check_directions(group, axes, cycle_time, keep)
         screen.stage("Measure, pass 1 of 2: an even grid over the band of the prior model")

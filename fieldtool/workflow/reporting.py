@@ -26,6 +26,7 @@ from fieldtool.report.contents import page_of
 from fieldtool.report.material import Material
 from fieldtool.report.page import write_page
 from fieldtool.workflow.models import prior_model, truth_model
+from fieldtool.workflow.rescued import rescue
 
 DOCUMENTS = ("prediction", "verification")
 """Files of later stages (``NAME.yaml``) that are shown where they are there."""
@@ -89,6 +90,10 @@ def material_of(folder: SessionFolder) -> Material:
             missing.append(f"{path.name} can not be read: {error}")
             return None
 
+    try:
+        rescue(folder)
+    except FieldtoolError as error:
+        missing.append(f"{folder.raw_rows.name} can not be put into the recording: {error}")
     machine = read(folder.machine, load_machine, "the machine's profile was not kept.")
     recording = read(folder.recording, load, "nothing was measured.")
     responses = read(folder.frequency_response, load_responses, "")

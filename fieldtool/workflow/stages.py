@@ -40,6 +40,7 @@ from fieldtool.workflow.models import (
     truth_model,
 )
 from fieldtool.workflow.reporting import report
+from fieldtool.workflow.rescued import rescue
 from fieldtool.workflow.session import (
     Options,
     Quiet,
@@ -169,6 +170,8 @@ def identify(
     """
     options = options or Options()
     folder = SessionFolder(source) if source.is_dir() else None
+    if folder:
+        rescue(folder)
     recording = load(folder.recording if folder else source)
     prior = None
     motors: dict[str, Estimate] = {}
@@ -269,6 +272,8 @@ def restore(
         If the backup is none, was made on other drives, or does not come back whole.
     """
     screen = screen or Quiet()
+    if backup.is_dir():
+        _rescued(SessionFolder(backup), screen)
     source = source_of(backup, store)
     profile = machine if isinstance(machine, MachineProfile) else load_machine(machine)
     lacking = [axis for axis in without if axis not in {a.name for a in profile.axes}]
@@ -288,6 +293,14 @@ def restore(
             without=without,
             say=screen.say,
         )
+
+
+def _rescued(folder: SessionFolder, screen: Screen) -> None:
+    """Rescue what was measured; what can not be rescued does not keep drives from being restored."""
+    try:
+        rescue(folder, screen.say)
+    except FieldtoolError as error:
+        screen.say(f"What the axes did last could not be put into the recording: {error}")
 
 
 def _reported(session: Session) -> None:

@@ -176,8 +176,8 @@ def _lock_of(journal_file: Path) -> FileLock:
     return FileLock(journal_file.with_suffix(".lock"), timeout=0)
 
 
-def _is_at_work(folder: Path) -> bool:
-    """Whether a living process has the journal of this session open."""
+def is_at_work(folder: Path) -> bool:
+    """Return whether a living process has the journal of this session open."""
     lock = _lock_of(folder / JOURNAL)
     if not Path(lock.lock_file).is_file():
         return False
@@ -196,7 +196,7 @@ def _at_work(folder: Path) -> str:
 
 
 def _refusal(folder: Path, axis: str, journal: Journal) -> UnfinishedWriteError:
-    if _is_at_work(folder):
+    if is_at_work(folder):
         return UnfinishedWriteError(f"{axis}: {_at_work(folder)}")
     what = (
         "a write of parameters was cut off, and the drives may hold old and new ones mixed"

@@ -243,7 +243,7 @@ class Bench:
         self.out.mkdir()
         (self.out / "machine.yaml").write_text(self.profile.read_text(), encoding="utf-8")
         axes = [
-            {"axis": a, "parameters": TUNING, "sensitivity_peak": 1.4, "reason": "bench"}
+            {"axis": a, "parameters": dict(TUNING), "sensitivity_peak": 1.4, "reason": "bench"}
             for a in NAMES.values()
         ]
         tuning = {"format": "fieldtool-tuning/1", "axes": axes}

@@ -44,7 +44,8 @@ def make_session(bench, folder, axes=("table", "arm")):
     tuning = {
         "format": "fieldtool-tuning/1",
         "axes": [
-            {"axis": a, "parameters": NEW, "sensitivity_peak": 1.4, "reason": "test"} for a in axes
+            {"axis": a, "parameters": dict(NEW), "sensitivity_peak": 1.4, "reason": "test"}
+            for a in axes
         ],
     }
     (folder / "tuning.yaml").write_text(yaml.safe_dump(tuning))

@@ -316,7 +316,6 @@ def test_an_enabled_drive_is_not_written(session):
 @pytest.mark.parametrize(
     ("parameters", "axes", "sentence"),
     [
-        ({"velocity_p": float("nan")}, ("table",), "table, velocity_p: nan is no number"),
         ({"velocity_p": -1.0}, ("table",), "table, velocity_p, object 0x2010:02: -1"),
         ({"velocity_p": 1e300}, ("table",), "does not fit the drive"),
         ({"speed": 1.0}, ("arm",), "has no parameter speed"),
@@ -330,6 +329,14 @@ def test_a_tuning_that_does_not_fit_is_refused_before_any_write(
     outcome = write(session)
     assert outcome.code == 3, outcome.err
     assert sentence in outcome.err
+    assert session.changed() == {}
+
+
+def test_a_tuning_with_numbers_that_are_none_is_refused_with_its_line(session):
+    write_tuning(session, {"velocity_p": float("nan")}, ("table",))
+    outcome = write(session)
+    assert outcome.code == 2
+    assert "tuning.yaml:4: 'axes.0.parameters.velocity_p'" in outcome.err
     assert session.changed() == {}
 
 
