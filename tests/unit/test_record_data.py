@@ -186,6 +186,39 @@ def test_periods_without_a_run_in_serve_as_well(random_model, fresh_rng):
                 assert abs(a.value - b.value) < 5 * a.std + 1e-3 * b.value
 
 
+def test_a_machine_that_has_settled_is_taken_to_be_settled(random_model, fresh_rng):
+    """Then the states at the ends cost nothing; from rest they are free."""
+    model = random_model(fresh_rng, (2, 1), friction=True)
+    whole = shaken(fresh_rng, model, periods=16, count=2).recording
+    keep, whole = 3 * round(PERIOD / STEP), with_noise(whole, fresh_rng)
+    late = [cut(one, slice(-keep, None)) for one in whole.experiments]
+    early = [cut(one, slice(0, keep)) for one in whole.experiments]
+    for experiments in (late, early):
+        recording = replace(whole, experiments=tuple(experiments))
+        records = WholeRecords(recording, joint_response(recording).lines, np.zeros(2))
+        data = records.data(as_found(model), run_in=True)
+        assert data.spread is not None
+        for spread in data.spread:
+            assert (spread is None or np.any(spread)) == (experiments is early)
+        found = refine(model, data, fit_friction=True)
+        for one, other in zip(found.model.axes, model.axes, strict=True):
+            for a, b in zip(one.masses, other.masses, strict=True):
+                assert abs(a.value - b.value) < 5 * a.std + 1e-4 * b.value
+        told = data.eliminated(model)
+        assert told == (0 if experiments is late else 2 * 2 * 3)
+
+
+def cut(one, rows):
+    """Some rows of an experiment, its time from 0."""
+    return replace(
+        one,
+        time=one.time[rows] - one.time[rows][0],
+        position=one.position[rows],
+        torque=one.torque[rows],
+        position_reference=one.position_reference[rows],
+    )
+
+
 def test_signs_of_velocity(fresh_rng):
     time = np.arange(3000) * STEP
     rates, phases = np.array([0.7, 1.9, 3.3]), fresh_rng.uniform(0, 6.0, 3)
