@@ -321,3 +321,19 @@ def test_a_small_mode_shows_in_what_a_machine_without_it_leaves(random_model, fr
         gains.append(data.gain_of_mode(found.model, found.delay_values, parameters, place, 0.01))
     noise = noise_limit(20, 2, 1e-6)
     assert gains[1] < noise < 3 * noise < gains[0]
+
+
+def test_a_coupling_that_is_left_out_shows_in_what_is_left(random_model, fresh_rng):
+    truth = random_model(fresh_rng, (2, 2), friction=True)
+    recording = with_noise(shaken(fresh_rng, truth).recording, fresh_rng)
+    data, gains = data_of(recording, truth), []
+    for value in (0.0, truth.couplings[0].value):
+        model = replace(truth, couplings=(replace(truth.couplings[0], value=value),))
+        listed = machine_parameters(model, data.omega)
+        (coupling,) = (p for p in listed if p.kind == "coupling")
+        found = refine(
+            model, data, fixed=[coupling.name], fit_friction=True, fit_load_friction=True
+        )
+        fitted = [p for p in listed if p.name in found.names]
+        gains.append(data.gain_of_parameter(found.model, found.delay_values, fitted, coupling))
+    assert gains[1] < 25 < 100 < gains[0]

@@ -184,8 +184,27 @@ class RecordData:
         any symmetric matrix; chi2-distributed with M (M + 1) / 2 degrees of freedom without a mode.
         Its own free motion is not reckoned with.
         """
-        systems = self.systems(model, delays)
-        told = np.concatenate([one.mode(omega, zeta) for one in systems])
+        told = [one.mode(omega, zeta) for one in self.systems(model, delays)]
+        return self._gain(np.concatenate(told), model, delays, parameters)
+
+    def gain_of_parameter(
+        self,
+        model: MachineModel,
+        delays: FloatArray,
+        parameters: Sequence[Parameter],
+        added: Parameter,
+    ) -> float:
+        """By how much chi2 would fall with one more parameter, likewise; with 1 degree of freedom."""
+        told = [one.jacobian([added]) for one in self.systems(model, delays)]
+        return self._gain(np.concatenate(told), model, delays, parameters)
+
+    def _gain(
+        self,
+        told: FloatArray,
+        model: MachineModel,
+        delays: FloatArray,
+        parameters: Sequence[Parameter],
+    ) -> float:
         answers = np.vstack([told, np.zeros((len(self.parts), told.shape[1]))])
         followed = np.linalg.qr(self.jacobian(model, delays, parameters))[0]
         for span in (self._span(model, delays), followed):

@@ -37,7 +37,7 @@ from fieldtool.identify.multisine.dry_friction import (
     without_dry_friction,
 )
 from fieldtool.identify.multisine.records import check_alive, moving_on, settled, with_periods
-from fieldtool.identify.multisine.second_look import still_in_doubt
+from fieldtool.identify.multisine.second_look import still_in_doubt, structure_still_in_doubt
 from fieldtool.identify.multisine.whole_records import WholeRecords
 from fieldtool.records.model import Estimate, Kind, MachineModel
 from fieldtool.records.recording import Experiment, Recording
@@ -121,14 +121,15 @@ def identify_joint(
     order: OrderSelection | None = None
     with _told_of_distortion(measured):
         if all(name in masses for name in recording.names):
-            modal, start = _known_order(data, masses, kinds, prior, notes)
+            modal, start, reduced = _known_order(data, masses, kinds, prior, notes)
         else:
             order = _chosen_order(data, masses, kinds, prior, notes)
             if order is not None:
-                modal, start = order.modal, order.model
+                modal, start, reduced = order.modal, order.model, order.reduced
             else:
                 last = {axis.name: len(axis.masses) for axis in prior.axes} if prior else {}
-                modal, start = _known_order(data, {**last, **masses}, kinds, prior, notes)
+                known = {**last, **masses}
+                modal, start, reduced = _known_order(data, known, kinds, prior, notes)
         priors = {f"{name}.mass[1]": mass for name, mass in (motor_masses or {}).items()}
         fit = _Fit([one.phasors(recording.names) for one in lines], recording, priors)
         first = _first_fit(_starts(start, modal, prior, kinds), data, priors)
@@ -137,6 +138,7 @@ def identify_joint(
             fitted, WholeRecords.of(recording, lines, friction), priors
         )
         _check_explained(fit.unexplained(fitted), friction)
+    notes += _structure_notes(reduced, fitted, whole)
     notes += _mode_notes(order, fitted, whole, data.omega.size)
     notes += _transient_note(measured, data, fitted)
     notes += [unknown.reason for unknown in fitted.unknown]
@@ -220,7 +222,7 @@ def _known_order(
     kinds: Mapping[str, Kind],
     prior: MachineModel | None,
     notes: list[str],
-) -> tuple[ModalModel, MachineModel]:
+) -> tuple[ModalModel, MachineModel, BlockReduced | None]:
     """Return modes and chains of known lengths; the prior's numbers where the chains fail."""
     modes = sum(masses[name] - 1 for name in data.names)
     same = prior is not None and all(len(axis.masses) == masses[axis.name] for axis in prior.axes)
@@ -231,9 +233,8 @@ def _known_order(
         if prior is None or not same:
             raise
         notes.append(f"Block order reduction failed ({error}); the fit began at the prior model.")
-        return modal, prior
-    notes += _structure_notes(reduced)
-    return modal, reduced.model
+        return modal, prior, None
+    return modal, reduced.model, reduced
 
 
 def _modes(data: ResponseMatrix, modes: int, prior: MachineModel | None) -> ModalModel:
@@ -260,7 +261,6 @@ def _chosen_order(
         notes.append(f"{error} The chains are as long as in the prior model.")
         return None
     notes += order.other_doubts
-    notes += _structure_notes(order.reduced)
     if order.runner_up is not None:
         notes.append(_runner_up(order, data.names))
     for axis in prior.axes if prior is not None else ():
@@ -319,8 +319,15 @@ def _first_fit(
     return best
 
 
-def _structure_notes(reduced: BlockReduced | None) -> list[str]:
-    return [] if reduced is None else list(reduced.notes)
+def _structure_notes(
+    reduced: BlockReduced | None, fitted: RefinedModel, whole: RecordData | None
+) -> list[str]:
+    """Say what the modes tell of couplings in unexpected places, where the records do not deny it."""
+    if reduced is None:
+        return []
+    if whole is None:
+        return list(reduced.notes)
+    return list(structure_still_in_doubt(reduced.structure, fitted, whole))
 
 
 class _Fit:
