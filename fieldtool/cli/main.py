@@ -61,6 +61,7 @@ from fieldtool.errors import (
     OutputError,
     PlanRefusedError,
 )
+from fieldtool.records.session_folder import SessionFolder
 from fieldtool.writeback.transaction import WriteBack
 
 app = typer.Typer(
@@ -421,7 +422,7 @@ def write(
     with stop_key() as key, TerminalScreen(console) as screen:
         stoppable = _StoppableScreen(screen, key)
         ask = _asker(console, yes, key, store)
-        profile = on_bus(folder / "machine.yaml", interface, channel, bitrate)
+        profile = on_bus(SessionFolder.existing(folder).profile, interface, channel, bitrate)
         result = workflow.write(folder, options, ask, screen=stoppable, machine=profile)
     show_parameters(console, result)
 
@@ -457,9 +458,9 @@ def restore(
     as_json: Json = False,
 ) -> None:
     """Bring a backup of the drives' parameters back, or take back a write that was cut off."""
-    folder = backup if backup.is_dir() else backup.parent
+    folder = backup.parent if backup.is_file() else backup
     if machine is None:
-        machine = str(folder / "machine.yaml")
+        machine = str(SessionFolder.existing(folder).profile)
     traced = trace_path(trace, trace_file, folder)
     console = console_of(as_json)
     with stop_key(), TerminalScreen(console) as screen:

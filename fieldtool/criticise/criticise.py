@@ -18,6 +18,7 @@ from fieldtool.criticise.criticism import (
 )
 from fieldtool.criticise.effects.base import Context, Effect
 from fieldtool.criticise.evidence.position import position_error
+from fieldtool.criticise.evidence.spans import Spans
 from fieldtool.criticise.extension import extended_model
 from fieldtool.criticise.numbers import numbers_of
 from fieldtool.criticise.search.afterwards import Accepted
@@ -26,6 +27,7 @@ from fieldtool.criticise.search.judge import Parts
 from fieldtool.criticise.search.machine import Machine
 from fieldtool.criticise.search.prepare import Prepared, prepare
 from fieldtool.criticise.search.search import Advance, Found, search
+from fieldtool.criticise.simulate.inverse import needed_torque
 from fieldtool.criticise.simulate.structure import Structure
 from fieldtool.criticise.tell_apart import experiment_for
 from fieldtool.criticise.where.sentences import (
@@ -45,6 +47,8 @@ NEAR_NOISE = 1.5
 """Error over noise (RMS) up to which it is all noise."""
 ENOUGH = 0.9
 """Share of the explainable error that has to be explained for "explained"."""
+OTHER_UNIT = 5.0
+"""Factor between measured and needed torque from which it is no fault of the machine."""
 FLAT = 0.02
 """Share of rows at one largest torque from which it is said that the drive was at its limit."""
 
@@ -92,6 +96,7 @@ def criticise(
         If nothing can be compared, or the model is of other axes.
     """
     prepared = prepare(recording, starting_model(model, prior), contiguous)
+    check_units(prepared)
     try:
         with np.errstate(over="ignore", invalid="ignore"):
             found = search(prepared, without, advance, _accepted_base(prepared, model, prior))
@@ -196,6 +201,41 @@ def _accepted_base(
     if set(values) != set(machine.names):
         return None
     return np.array([values[name] for name in machine.names])
+
+
+def check_units(prepared: Prepared) -> None:
+    """Refuse a recording whose torques can not belong to its motions, by the model.
+
+    A wrong scale of a torque or a new tool is a factor of two or so, a unit is one of 57 or 1000.
+
+    Raises
+    ------
+    NotEnoughDataError
+        Naming the axis, the factor, and the units that differ by it.
+    """
+    start = prepared.start
+    structure = Structure.of(start.machine.with_values(start.base))
+    torques = {name: needed_torque(structure, m) for name, m in prepared.motions.items()}
+    for k, axis in enumerate(prepared.recording.axes):
+        if axis.torque_unit == "A":
+            continue  # how many N m an A is, nobody has said
+        measured = needed = 0.0
+        for name, motion in prepared.motions.items():
+            rows = motion.counted[:, k] > 0
+            measured += float(np.sum(motion.torque[rows, k] ** 2))
+            needed += float(np.sum(torques[name][rows, k] ** 2))
+        if needed <= 0.0 or measured <= 0.0 or not np.isfinite(needed):
+            continue
+        factor = float(np.sqrt(measured / needed))
+        if not 1 / OTHER_UNIT < factor < OTHER_UNIT:
+            raise NotEnoughDataError(
+                f"{axis.name}: its torque is {factor:.2g} times the one that its motion needs by "
+                "the model. No machine changes by that much: the recording and the model are of "
+                f"different machines, or a unit is wrong ({axis.position_unit} and "
+                f"{axis.torque_unit} are stated; degrees would make a factor of 57, revolutions "
+                "one of 6.3, thousandths one of 1000). Correct the units, then import and "
+                "criticise again."
+            )
 
 
 def _all_parts(found: Found, fitted: Fitted) -> Parts:
@@ -304,13 +344,16 @@ def _notes(recording: Recording, found: Found) -> tuple[str, ...]:
         seconds = sum(s.stop - s.start for s in spans.spans if s.role == "unseen")
         notes.append(
             "There are no experiments of a kind twice, so the data are cut in time: "
-            f"{seconds * recording.sample_period:.3g} s in "
-            f"{sum(s.role == 'unseen' for s in spans.spans)} stretches are kept unseen."
+            f"{seconds * recording.sample_period:.3g} s are kept unseen, in {_stretches(spans)}."
         )
     if any(s.periods < 2 for s in spans.spans):
+        why = (
+            "No stretch that is compared holds a period twice"
+            if any(e.period for e in recording.experiments if e.kind == "multisine")
+            else "The excitation does not repeat"
+        )
         notes.append(
-            "The excitation does not repeat, so the noise is not known: what is not explained may in "
-            "part be noise."
+            f"{why}, so the noise is not known: what is not explained may in part be noise."
         )
     for k, axis in enumerate(recording.axes):
         if axis.controller is None:
@@ -325,6 +368,11 @@ def _notes(recording: Recording, found: Found) -> tuple[str, ...]:
                 "rows: the drive was at its limit there."
             )
     return tuple(notes)
+
+
+def _stretches(spans: Spans) -> str:
+    count = sum(s.role == "unseen" for s in spans.spans)
+    return "one stretch" if count == 1 else f"{count} stretches"
 
 
 def _flat_share(found: Found, axis: int) -> float:

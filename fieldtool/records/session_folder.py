@@ -48,10 +48,17 @@ class SessionFolder:
         folder = cls(path)
         if not path.exists():
             raise FileFormatError(
-                path, "does not exist. Give the folder of a session (--out of a run)."
+                path,
+                "does not exist. Give the folder of a session (--out of a run), or one of its files.",
             )
         if not path.is_dir():
             raise FileFormatError(path, "is a file. Give the folder of a session.")
+        if (path / "recording.yaml").is_file():
+            raise FileFormatError(
+                path,
+                "holds a recording as CSV files. Make it one file first: "
+                f"`fieldtool import {path} -o FILE.h5`, then give FILE.h5.",
+            )
         if not any(p.is_file() for p in (folder.machine, folder.recording, folder.events)):
             raise FileFormatError(
                 path,
@@ -60,10 +67,50 @@ class SessionFolder:
             )
         return folder
 
+    @classmethod
+    def of_source(cls, source: Path) -> "SessionFolder | None":
+        """Return the session folder that was given, or None where it is a file (a recording).
+
+        Raises
+        ------
+        FileFormatError
+            If there is neither, or the folder is none of a session.
+        """
+        if source.is_file():
+            return None
+        folder = cls.existing(source)
+        folder.needed(folder.recording, "`fieldtool measure`")
+        return folder
+
+    def needed(self, path: Path, made_by: str) -> Path:
+        """Return one of the folder's files, which a stage cannot do without.
+
+        Raises
+        ------
+        FileFormatError
+            If it is not there: with what makes it.
+        """
+        if not path.is_file():
+            raise FileFormatError(
+                self.path, f"holds no {path.name}; {made_by} makes it. Nothing was done."
+            )
+        return path
+
     @property
     def machine(self) -> Path:
         """Resolved machine profile."""
         return self.path / "machine.yaml"
+
+    @property
+    def profile(self) -> Path:
+        """Machine profile, which has to be there.
+
+        Raises
+        ------
+        FileFormatError
+            If it is not.
+        """
+        return self.needed(self.machine, "`fieldtool run`, `measure` and others")
 
     @property
     def parameters_before(self) -> Path:

@@ -10,11 +10,11 @@ from fieldtool.criticise.criticise import Criticised, criticise
 from fieldtool.criticise.criticism import Criticism
 from fieldtool.criticise.pictured import pictures_of
 from fieldtool.criticise.pictures_file import save_pictures
-from fieldtool.errors import NotEnoughDataError
+from fieldtool.errors import IdentificationError, NotEnoughDataError
 from fieldtool.identify.recorded import identify_recording
 from fieldtool.records.model import MachineModel
 from fieldtool.records.model_file import read_model, write_model
-from fieldtool.records.recording import load
+from fieldtool.records.recording import Recording, load
 from fieldtool.records.session_folder import SessionFolder
 from fieldtool.records.yaml_file import write_yaml
 from fieldtool.report.criticism_picture import draw_criticism
@@ -25,6 +25,8 @@ from fieldtool.workflow.rescued import rescue
 from fieldtool.workflow.session import Session
 
 Advance = Callable[[str, float], None]
+LIGHTER = 0.5
+"""Of the motor's inertia: all masses of an axis together can not be less."""
 KNOWN = 0.3
 """Relative standard error up to which a mass or spring of the extended model replaces the old one."""
 
@@ -58,7 +60,7 @@ def criticise_source(
     NotEnoughDataError, IdentificationError
         If the data do not allow it.
     """
-    folder = SessionFolder(source) if source.is_dir() else None
+    folder = SessionFolder.of_source(source)
     if folder:
         rescue(folder)
     recording = load(folder.recording if folder else source)
@@ -71,7 +73,7 @@ def criticise_source(
         model = read_model(folder.model)
     else:
         advance("identify", 0.0)
-        model = identify_recording(recording, {}, prior).model
+        model = _identified(recording, prior)
     found = criticise(recording, model, alike(prior, model), advance=advance)
     if folder:
         keep(folder, found, model)
@@ -83,6 +85,36 @@ def criticise_source(
     elif report is not None:
         report_of_recording(source, found, recording, report)
     return found
+
+
+def _identified(recording: Recording, prior: MachineModel | None) -> MachineModel:
+    """Identify first; where that fails, say that a model can be given.
+
+    Raises
+    ------
+    IdentificationError
+        If the data do not allow it, or contradict the motors' data sheets.
+    """
+    try:
+        model = identify_recording(recording, {}, prior).model
+    except IdentificationError as error:
+        error.add_note(
+            "There is no model yet, so the recording was to be identified first. If you have a "
+            "model of this machine, give it: --model model.yaml."
+        )
+        raise
+    for info, axis in zip(recording.axes, model.axes, strict=True):
+        if info.torque_unit == "A" or not info.motor_inertia:
+            continue
+        if axis.total_mass < LIGHTER * info.motor_inertia:
+            unit = "kg m2" if info.kind == "rotary" else "kg"
+            raise IdentificationError(
+                f"{info.name}: by its torque and motion all its masses come to "
+                f"{axis.total_mass:.3g} {unit}, its motor alone has {info.motor_inertia:.3g} "
+                f"{unit} by the data sheet. A unit of torque or position is wrong, or the motor's "
+                "inertia: correct it, and import again."
+            )
+    return model
 
 
 def criticised(

@@ -50,7 +50,8 @@ def redesign(
     DesignError, IdentificationError
         If nothing can be designed; what was kept before is unchanged.
     """
-    folder = SessionFolder(folder_path)
+    folder = SessionFolder.existing(folder_path)
+    folder.needed(folder.model, "`fieldtool identify` on this folder")
     machine, model = load_machine(folder.machine), read_model(folder.model)
     check_known(model)
     tuning = designed(folder, machine, model, response, bound, advance)

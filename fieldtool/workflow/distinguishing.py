@@ -93,10 +93,7 @@ def question_of(folder_path: Path, machine: MachineProfile) -> Question:
         If its criticism leaves no tie.
     """
     folder = SessionFolder.existing(folder_path)
-    if not folder.criticism.is_file():
-        raise FileFormatError(
-            folder_path, "holds no criticism.yaml: `fieldtool criticise` on this folder first."
-        )
+    folder.needed(folder.criticism, "`fieldtool criticise` on this folder")
     model, recording = read_model(folder.model), load(folder.recording)
     criticism = read_criticism(folder.criticism, model)
     names = tuple(a.name for a in machine.axes)

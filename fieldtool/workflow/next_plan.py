@@ -49,7 +49,7 @@ def next_plan(
     """
     options = options or Options()
     found = identify(source, options, masses)
-    folder = SessionFolder(source) if source.is_dir() else None
+    folder = SessionFolder.of_source(source)
     recording = load(folder.recording if folder else source)
     limits = _envelope(recording)
     if folder and folder.machine.is_file():

@@ -17,6 +17,7 @@ from fieldtool.records.recording import (
     load,
     save,
 )
+from fieldtool.records.session_folder import SessionFolder
 
 VIRTUAL_TIME = "fieldsim"
 """python-can interface of the simulated machine in virtual time."""
@@ -56,7 +57,8 @@ def compare(
     band
         Hz.
     """
-    data = load(recording)
+    folder = SessionFolder.of_source(recording)
+    data = load(folder.recording if folder else recording)
     if len(data.axes) != 1:
         raise NotEnoughDataError(
             f"{recording}: the load side is predicted for recordings of a single axis; this one has "

@@ -169,7 +169,7 @@ def identify(
         If the data do not allow it.
     """
     options = options or Options()
-    folder = SessionFolder(source) if source.is_dir() else None
+    folder = SessionFolder.of_source(source)
     if folder:
         rescue(folder)
     recording = load(folder.recording if folder else source)
@@ -228,8 +228,8 @@ def write(
     DrivesError, FieldtoolError
         As :func:`run`.
     """
-    folder = SessionFolder(folder_path)
-    tuning = read_tuning(folder.tuning)
+    folder = SessionFolder.existing(folder_path)
+    tuning = read_tuning(folder.needed(folder.tuning, "`fieldtool design` on this folder"))
     profile = machine or folder.machine
     with open_session(profile, folder_path, screen, never, True, "write", options) as (s, group):
         result = _write(s, group, tuning, options, confirm)

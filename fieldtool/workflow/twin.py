@@ -59,12 +59,7 @@ def twin(folder_path: Path, out: Path | None = None) -> Twin:
     """
     folder = SessionFolder.existing(folder_path)
     machine = _machine(folder)
-    if not folder.model.is_file():
-        raise FileFormatError(
-            folder.path,
-            "holds no model.yaml, so there is nothing to rebuild: `fieldtool identify` on this "
-            "folder first.",
-        )
+    folder.needed(folder.model, "`fieldtool identify` on this folder")
     model, recording = read_model(folder.model), load(folder.recording)
     if model.names != tuple(a.name for a in machine.axes):
         raise FileFormatError(

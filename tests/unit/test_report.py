@@ -21,19 +21,17 @@ from fieldtool.criticise.criticism_file import read_criticism
 from fieldtool.criticise.pictured import pictures_of
 from fieldtool.criticise.pictures_file import load_pictures, save_pictures
 from fieldtool.errors import FileFormatError
-from fieldtool.records.closed_loop import AxisLoop, ClosedLoop
-from fieldtool.records.model import AxisModel, Coupling, Estimate, MachineModel
+from fieldtool.records.model import Estimate
 from fieldtool.records.model_file import write_model
-from fieldtool.records.recording import AxisInfo, Controller, Experiment, Recording, save
+from fieldtool.records.recording import save
 from fieldtool.records.session_folder import SessionFolder
 from fieldtool.records.yaml_file import write_yaml
 from fieldtool.report.page import Page, html_of
 from fieldtool.report.section import Plot, Section, Table, Words
 from fieldtool.workflow.reporting import material_of, report
+from tests.unit.late_axis import FINE, MODEL, STEP, recorded
 
 HOSTILE = "</script><script>alert(1)</script> \"'><img src=x onerror=alert(2)> {{7*7}} & \u2028"
-STEP, FINE, ROWS, PERIODS = 1e-3, 8, 1024, 4
-GAINS = (15.0, 1.2, 8.0)
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 CHROMIUM = next((path for name in BROWSERS if (path := shutil.which(name))), None)
 
@@ -115,62 +113,13 @@ def test_the_policy_names_the_two_scripts_and_nothing_else():
     assert "http" not in policy
 
 
-def numbers(*values):
-    return tuple(Estimate(v, 0.01 * v) for v in values)
-
-
-MODEL = MachineModel(
-    (
-        AxisModel(
-            "a", "rotary", numbers(0.02, 0.03), numbers(190.0), numbers(0.03), Estimate(0.02)
-        ),
-        AxisModel("b", "rotary", numbers(0.04), (), (), Estimate(0.015)),
-    ),
-    (Coupling(("a", "b"), 0.006, 1e-5),),
-)
-
-
-def recorded(rng, delay, gain=1.0):
-    """Two axes in closed loop; the position of b is measured late."""
-    loop = ClosedLoop(MODEL, (AxisLoop(*GAINS), AxisLoop(*GAINS)))
-    time = np.arange(ROWS * FINE) * STEP / FINE
-    experiments = []
-    for number in range(4):
-        fine = np.zeros((time.size, 2))
-        for axis in range(2):
-            for k in range(1, 26, 2):
-                f = k / (ROWS * STEP)
-                fine[:, axis] += (
-                    0.02 / (1 + f / 4) * np.sin(2 * np.pi * f * time + rng.uniform(0, 6))
-                )
-        fine = np.tile(fine, (PERIODS + 2, 1))
-        position, torque = loop.simulate(fine, STEP / FINE)
-        torque[1:] = (torque[1:] + torque[:-1]) / 2.0
-        late = np.column_stack(
-            [position[:, 0], np.roll(position[:, 1], round(delay * FINE / STEP))]
-        )
-        rows = slice(2 * ROWS * FINE, None, FINE)
-        tau = torque[rows] + 0.004 * rng.normal(size=torque[rows].shape)
-        counts = 2**20 / (2 * np.pi)
-        experiments.append(
-            Experiment(
-                f"run {number} <b>", "multisine", ("a", "b"), (), ROWS * STEP,
-                STEP * np.arange(len(tau)), np.round(late[rows] * counts) / counts, gain * tau,
-                position_reference=fine[rows],
-            )
-        )  # fmt: skip
-    axes = tuple(
-        AxisInfo(axis.name, "rotary", len(axis.masses), controller=Controller(*GAINS, 6.0))
-        for axis in MODEL.axes
-    )
-    return Recording(STEP, axes, tuple(experiments), HOSTILE.replace("\u2028", ""))
-
-
 @pytest.fixture(scope="module")
 def session(tmp_path_factory):
     """A folder with a recording, a model, and a criticism that names a delay."""
     folder = SessionFolder.create(tmp_path_factory.mktemp("session") / "s")
-    recording = recorded(np.random.default_rng(5), 12 * STEP / FINE)
+    recording = recorded(
+        np.random.default_rng(5), 12 * STEP / FINE, " <b>", HOSTILE.replace("\u2028", "")
+    )
     save(recording, folder.recording)
     found = criticise(recording, MODEL, MODEL)
     write_model(found.criticism.model, folder.model)
