@@ -12,6 +12,8 @@ ComplexArray = NDArray[np.complexfloating[Any, Any]]
 STEP_BAND = 0.02
 """Of a step's height: within it the step has settled."""
 CREEPS = 24
+ENOUGH = 2000
+"""Samples from which a creep is chosen."""
 FASTEST_CREEP, SLOWEST_CREEP = 0.01, 2.0
 """Time constants of the creep that is told from the oscillation, over the record's length."""
 
@@ -145,14 +147,18 @@ def oscillation(time: FloatArray, error: FloatArray) -> FloatArray:
     if time.size < 4 or not np.any(error):
         return np.zeros_like(error)
     t = (time - time[0]) / (time[-1] - time[0])
-    best, least = error - error.mean(), np.inf
-    for tau in np.geomspace(FASTEST_CREEP, SLOWEST_CREEP, CREEPS):
-        basis = np.column_stack([np.ones_like(t), np.exp(-t / tau)])
-        left = error - basis @ np.linalg.lstsq(basis, error, rcond=None)[0]
-        size = float(left @ left)
-        if size < least:
-            best, least = left, size
-    return np.asarray(best, dtype=np.float64)
+    taus = np.geomspace(FASTEST_CREEP, SLOWEST_CREEP, CREEPS)
+    few = slice(None, None, max(time.size // ENOUGH, 1))
+    creeps = np.exp(-t[few, None] / taus)
+    creeps -= creeps.mean(axis=0)
+    middle = error[few] - error[few].mean()
+    # what each creep takes off the sum of squares
+    taken = (middle @ creeps) ** 2 / np.maximum((creeps**2).sum(axis=0), 1e-300)
+    creep = np.exp(-t / taus[int(np.argmax(taken))])
+    creep -= creep.mean()
+    swing = error - error.mean()
+    swing = swing - creep * float(swing @ creep) / float(creep @ creep)
+    return np.asarray(swing, dtype=np.float64)
 
 
 def sensitivity_peak(sensitivity: ComplexArray) -> float:
