@@ -90,7 +90,7 @@ def show_tuning(console: Console, tuning: Tuning) -> None:
 
 def _table(tuning: Tuning) -> Table:
     table = Table(box=None, padding=(0, 2))
-    table.add_column("predicted")
+    table.add_column("predicted (SI)")
     prediction = tuning.prediction
     axes = prediction.axes if prediction is not None else ()
     for axis in axes:

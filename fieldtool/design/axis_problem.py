@@ -44,7 +44,7 @@ INNER_BAND = 0.7
 """Of the band: where the search wants an axis to be, so that it is in the band for sure."""
 MOVED, PUSHED = 2.0, 0.3
 """Weights of the axis' move and of a disturbance."""
-DURING = 0.02
+DURING = 0.05
 """Weight of the following error before the move has ended, for the feed-forward."""
 MOST_FED = np.array([1.0, 1.3])
 """Velocity feed-forward, and inertia feed-forward over the axis' own inertia, at most."""
