@@ -18,6 +18,10 @@ EXPERIMENTS: dict[frozenset[str], str] = {
         "repeat the excitation at a fifth of its size: a gap softens the spring at small "
         "amplitudes, a cubic spring does not"
     ),
+    frozenset({"coulomb_friction", "asymmetric_friction"}): (
+        "read the torque with the power stage off: if that is not zero, the zero of its measurement is "
+        "off, else friction differs between the directions"
+    ),
     frozenset({"coulomb_friction", "stribeck_friction"}): (
         "move at constant speeds from very slow to fast: only Stribeck friction falls with the speed"
     ),

@@ -93,7 +93,7 @@ def _total(machine: Machine, axis: int) -> float:
 
 
 def _periods(rng: np.random.Generator) -> float:
-    return float(rng.choice([4, 6, 8, 12, 16, 18, 24]))
+    return float(rng.choice([8, 12, 16, 18, 24]))
 
 
 def _phase(rng: np.random.Generator) -> float:
@@ -123,7 +123,7 @@ MAKERS: Mapping[str, Maker] = {
     ),
     "structural_damping": lambda m, a, s, r: StructuralDamping(min(0.15 * s, 0.5), _joint(m, a, r)),
     "stiffness_change": lambda m, a, s, r: StiffnessChange(
-        float(1 / (1 + s)), float(r.uniform(50.0, 75.0)), 0.05, _joint(m, a, r)
+        float(1 / (1 + s)), float(r.uniform(46.0, 60.0)), 0.05, _joint(m, a, r)
     ),
     "gravity": lambda m, a, s, r: Gravity(0.2 * s * m.peak[a], float(r.uniform(-1.5, 1.5))),
     "cogging": lambda m, a, s, r: Cogging(0.1 * s * m.peak[a], _periods(r), _phase(r)),

@@ -27,6 +27,8 @@ MULTISINE, PERIODS, RUN_IN = 4.0, 4, 1
 """Period, s; periods measured; periods before them."""
 MOVES = 20.0
 """s."""
+SLOW = 0.6
+"""Hz: above it the multisines' acceleration is flat."""
 LEVELS = (0.4, 1.0)
 LINEAR_TARGETS = "linear_targets"
 """How a recording says that its drives go straight from target to target."""
@@ -146,7 +148,7 @@ def record(
     noise
         Whether the torque has its measurement noise.
     short
-        One multisine only, to see the size of an effect.
+        One period of one multisine only, to see the size of an effect.
     with_moves
         Moves of 20 s at two speeds after the multisines.
     """
@@ -161,7 +163,7 @@ def record(
             courses = np.column_stack(
                 [level * _multisine(machine, a, phases[k, a] + turn[a]) for a in range(count)]
             )
-            periodic = np.tile(courses, (PERIODS + RUN_IN, 1))
+            periodic = np.tile(courses, (RUN_IN + (1 if short else PERIODS), 1))
             rise = np.minimum(np.arange(periodic.shape[0]) / 1000.0, 1.0)[:, None]
             multisines.append((f"multisine {len(multisines) + 1}", periodic * rise))
     moves = []
@@ -197,7 +199,7 @@ def _multisine(machine: Machine, axis: int, phases: FloatArray) -> FloatArray:
     time = np.arange(round(MULTISINE / PERIOD)) * PERIOD
     total = sum(machine.plant.chains[axis].masses)
     turning = np.exp(1j * (np.outer(time, omega) + phases))
-    moved = 1.0 / (1.0 + (omega / (4 * pi)) ** 2)
+    moved = 1.0 / (1.0 + (omega / (2 * pi * SLOW)) ** 2)
     torque = total * omega**2 * moved
     position, proportional, integral = machine.gains[axis]
     velocity_loop = proportional + integral / (1j * omega)

@@ -61,6 +61,8 @@ class Effect:
     """The second axis of what joins two."""
     replaces: tuple[str, ...] = field(default=())
     """Simpler effects on the same axis that this one contains."""
+    number: int = 0
+    """Of those that are alike but for their numbers, as two waves of the position."""
 
     @property
     def seen_by(self) -> tuple[str, ...]:
@@ -68,9 +70,9 @@ class Effect:
         return () if self.location == "load" else self.shows
 
     @property
-    def key(self) -> tuple[str, int, str, int | None]:
-        """What tells it from all others: name, axis, location, other axis."""
-        return self.name, self.axis, self.location, self.other
+    def key(self) -> tuple[str, int, str, int | None, int]:
+        """What tells it from all others: name, axis, location, other axis, number."""
+        return self.name, self.axis, self.location, self.other, self.number
 
     def structure(self, structure: Structure, values: Values) -> Structure:
         """Return the structure with the effect in it."""

@@ -73,7 +73,7 @@ class StribeckFriction(Effect):
     source = "Stribeck 1902; Bo and Pavelescu, Wear 82, 1982 (exponent 2)"
     signature = "follows the sign of the velocity, and is larger at low speed than at high speed"
     contrary = "a torque that is the same at all speeds; even harmonics"
-    shows = ("speed",)
+    shows = ("speed", "direction")
 
     def torque(self, motion: Motion, values: Values) -> FloatArray | None:
         """At the motor; the parameter ``extra`` is breakaway less sliding friction."""

@@ -78,7 +78,6 @@ class EncoderError(Effect):
     source = "eccentricity and interpolation errors; Ellis, Control System Design Guide, 2012"
     signature = "torque at one order of the position that grows with the square of the speed"
     contrary = "the same torque at all speeds"
-    shows = ("position",)
 
     def motion(self, motion: Motion, values: Values) -> Motion:
         """Take the error off the measured position."""

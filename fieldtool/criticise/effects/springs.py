@@ -12,9 +12,9 @@ from fieldtool.criticise.simulate.structure import Element, Law, Relaxation, Str
 
 GAPS = (0.02, 0.2, 1.0, 4.0)
 """Start values of half the gap over the RMS of the elongation that rigid masses would ask for."""
-BRANCHES = 5
+BRANCHES = 7
 """Maxwell branches that make damping nearly the same at all frequencies."""
-MODES = 14
+MODES = 20
 """Frequencies at which a further mass is tried."""
 
 
@@ -188,9 +188,10 @@ def spring_candidates(context: Context) -> list[Effect]:
                 )
                 for t in _times(context)
             ]
-            low = max(0.3, 2.0 / max(m.rows * m.step for m in context.motions))
+            low = 0.3 * max(0.3, 2.0 / max(m.rows * m.step for m in context.motions))
+            high = 3.0 * context.top
             fixed = (Parameter("low", "Hz", low, low, low, 0.0),
-                     Parameter("high", "Hz", context.top, context.top, context.top, 0.0))  # fmt: skip
+                     Parameter("high", "Hz", high, high, high, 0.0))  # fmt: skip
             loss = Parameter("loss_factor", "1", 0.0, 0.0, 1.0, 0.01, linear=True)
             out.append(StructuralDamping(axis, (loss, *fixed), place))
     return out

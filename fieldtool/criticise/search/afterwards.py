@@ -4,17 +4,34 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from fieldtool.criticise.effects.base import Effect
-from fieldtool.criticise.search.fit import Fitted, fit
+from fieldtool.criticise.effects.friction import friction_candidates
+from fieldtool.criticise.search.fit import Fitted, fit, strain
 from fieldtool.criticise.search.hypothesis import Hypothesis
-from fieldtool.criticise.search.judge import axis_power, difference, explained_torque
+from fieldtool.criticise.search.judge import (
+    axis_power,
+    difference,
+    explained_torque,
+    moved,
+    relative_errors,
+)
 from fieldtool.criticise.search.prepare import Prepared
-from fieldtool.criticise.search.rules import ALIKE_T, Tried
+from fieldtool.criticise.search.rules import (
+    ALIKE_SHARE,
+    ALIKE_T,
+    LEAST_TORQUE,
+    LESS_MOVED,
+    STAYED,
+    Tried,
+)
 from fieldtool.criticise.search.significance import compared
 from fieldtool.criticise.where.views import views_of
 
 SHOWN = 0.3
 """Share of what an effect explains, that the view which it must show has to explain."""
 FEW_STEPS = 6
+OFF_ZERO = 3.0
+"""Standard errors of a torque's zero, from which friction may differ between the directions instead."""
+DIRECTIONS = ("coulomb_friction", "asymmetric_friction")
 
 Reasons = dict[object, tuple[Effect, str]]
 
@@ -53,6 +70,8 @@ def pruned(
             gain = compared(before, parts)
             torque = explained_torque(before, parts, effect.axis)
             why = "" if gain.t >= ALIKE_T else "is not missed once the others are there"
+            if torque < LEAST_TORQUE:
+                why = "lowers no error on unseen data once the others are there"
             judged.append((replace(a, tried=replace(a.tried, gain=gain, torque=torque)), less, why))
         worst = min(judged, key=lambda j: j[0].tried.gain.t)
         reason = worst[2]
@@ -102,25 +121,115 @@ def tied(
 
     Of a delay and what mimics it the delay is named first; else what does best.
     """
+    current, accepted = with_directions(prepared, current, accepted)
     out: list[Accepted] = []
     named = {a.tried.effect.key for a in accepted}
     for a in accepted:
-        first, ties = a.tried, list[Tried]()
+        first, ties = a.tried, [t for t in a.ties if t.effect.name in DIRECTIONS]
         for rival in a.ties:
-            if rival.effect.key in named:
+            if rival.effect.key in named or rival in ties:
                 continue
             swapped = current.hypothesis.without(place_of(current.hypothesis, first.effect))
             swapped = swapped.with_effect(rival.effect)
             values = rival.fitted.hypothesis.values[rival.place]
             swapped = replace(swapped, values=(*swapped.values[:-1], values))
+            if len(rival.fitted.hypothesis.effects) == len(swapped.effects):
+                swapped = replace(swapped, base=rival.fitted.hypothesis.base)
             fitted = fit(prepared.simulator, swapped)
-            gain = difference(prepared.simulator, fitted, current)
-            if gain.t >= ALIKE_T:
+            worse = difference(prepared.simulator, fitted, current)
+            enough = ALIKE_SHARE * max(first.gain.before - first.gain.after, 0.0)
+            if worse.t >= ALIKE_T and worse.before - worse.after > enough:
                 continue
-            if gain.before <= gain.after and first.effect.name != "measurement_delay":
+            if first.effect.name != "measurement_delay" and _preferred(
+                prepared, fitted, current, enough
+            ):
                 ties.append(replace(first, fitted=current))
                 first, current = replace(rival, fitted=fitted), fitted
             else:
                 ties.append(replace(rival, fitted=fitted))
         out.append(Accepted(first, tuple(ties)))
     return current, out
+
+
+def _preferred(prepared: Prepared, rival: Fitted, first: Fitted, enough: float) -> bool:
+    """Whether a rival stands before the first: clearly better, or as good and the machine as it was."""
+    there, here = (moved(f, prepared.accepted) for f in (rival, first))
+    if max(there, here) > STAYED and not here / LESS_MOVED < there < here * LESS_MOVED:
+        return there < here
+    better = difference(prepared.simulator, first, rival)
+    return better.t >= ALIKE_T and better.before - better.after > enough
+
+
+def with_directions(
+    prepared: Prepared, current: Fitted, accepted: Sequence[Accepted]
+) -> tuple[Fitted, list[Accepted]]:
+    """Add friction that differs between the directions, as a rival of dry friction on a false zero.
+
+    Friction F+ forward and F- backward is dry friction of (F+ + F-) / 2 and a constant (F+ - F-) / 2.
+    Where the zero of the torque would have to be further off than is likely, the directions differ.
+    """
+    out: list[Accepted] = []
+    for a in accepted:
+        effect = a.tried.effect
+        name = f"{prepared.recording.names[effect.axis]}.offset"
+        known = effect.name == "coulomb_friction" and effect.location == "motor"
+        if not known or name not in current.names:
+            out.append(a)
+            continue
+        k = current.names.index(name)
+        off = float(current.values[k])
+        kinds = friction_candidates(prepared.context(current.hypothesis))
+        rival = next(e for e in kinds if e.name == "asymmetric_friction" and e.axis == effect.axis)
+        if abs(off) < OFF_ZERO * current.std[k]:
+            out.append(a)
+            continue
+        place = place_of(current.hypothesis, effect)
+        values, machine = current.hypothesis.values[place], current.hypothesis.machine
+        names = prepared.recording.names[effect.axis]
+        wet = dict(zip(machine.names, current.hypothesis.base, strict=True))
+        swapped = current.hypothesis.without(place).with_effect(rival)
+        start = {
+            "coulomb_positive": values["torque"] + off,
+            "coulomb_negative": values["torque"] - off,
+            "viscous_positive": wet.get(f"{names}.viscous_friction", 0.0),
+            "viscous_negative": wet.get(f"{names}.viscous_friction", 0.0),
+            "presliding": values["presliding"],
+            "rounding": values["rounding"],
+        }
+        base = swapped.base.copy()
+        base[machine.names.index(name)] = 0.0
+        swapped = replace(swapped, base=base, values=(*swapped.values[:-1], start))
+        fitted = fit(prepared.simulator, swapped)
+        if difference(prepared.simulator, fitted, current).t >= ALIKE_T:
+            out.append(a)
+            continue
+        other = replace(a.tried, effect=rival, fitted=fitted)
+        if strain(current) > strain(fitted) + ALIKE_T**2:
+            out.append(Accepted(other, (replace(a.tried, fitted=current), *a.ties)))
+            current = fitted
+        else:
+            out.append(Accepted(a.tried, (other, *a.ties)))
+    return current, out
+
+
+def unharmful(
+    prepared: Prepared,
+    before: Fitted,
+    current: Fitted,
+    accepted: Sequence[Accepted],
+    rejected: Reasons,
+) -> tuple[Fitted, list[Accepted]]:
+    """Take causes out, the least first, until the error on unseen data is not larger than before."""
+    kept = list(accepted)
+    allowed = relative_errors(prepared.simulator.parts(before.hypothesis, "unseen")).sum()
+    while kept:
+        reached = relative_errors(prepared.simulator.parts(current.hypothesis, "unseen")).sum()
+        if reached < allowed:
+            break
+        least = min(kept, key=lambda a: a.tried.gain.t)
+        effect = least.tried.effect
+        rejected[effect.key] = (effect, "the error on unseen data would be larger with it")
+        kept.remove(least)
+        place = place_of(current.hypothesis, effect)
+        current = fit(prepared.simulator, current.hypothesis.without(place))
+    return current, kept

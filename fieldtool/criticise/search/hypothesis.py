@@ -18,6 +18,8 @@ from fieldtool.criticise.simulate.structure import Structure
 FloatArray = NDArray[np.float64]
 KEPT = 48
 """Simulations of the chains that are remembered."""
+SEVERAL = ("cogging", "encoder_error", "extra_mode", "periodic_disturbance")
+"""Effects of which there may be more than one at a place."""
 THINNED = 3
 """Every so many rows count where the first state of the hidden masses is found."""
 
@@ -41,13 +43,13 @@ class Hypothesis:
 
     def with_effect(self, effect: Effect) -> "Hypothesis":
         """Add one effect at its start values; what it contains goes."""
+        alike = [e for e in self.effects if e.name == effect.name and e.key[:4] == effect.key[:4]]
+        if alike and effect.name in SEVERAL:
+            effect = replace(effect, number=1 + max(e.number for e in alike))
         kept = [
             (e, v)
             for e, v in zip(self.effects, self.values, strict=True)
-            if not (e.axis == effect.axis and e.name in effect.replaces)
-            and not (
-                e.key == effect.key and e.name not in {"cogging", "encoder_error", "extra_mode"}
-            )
+            if not (e.axis == effect.axis and e.name in effect.replaces) and e.key != effect.key
         ]
         start = {p.name: p.start for p in effect.parameters}
         grown = replace(
@@ -151,8 +153,8 @@ class Simulator:
         The first state is not measured; a wrong one rings on at the structure's own frequencies.
         """
         needed = needed_torque(structure, motion)
-        if not structure.hidden.size:
-            return needed
+        if not structure.hidden.size or not np.all(np.isfinite(needed)):
+            return needed  # what runs away is no better than anything
         system, courses = self._free_motions(structure, motion.step)
         some = slice(0, courses.shape[1] * THINNED, THINNED)
         counted = motion.counted[some]

@@ -50,6 +50,21 @@ def beyond_noise(parts: Parts, axes: Sequence[int]) -> float:
     return there / noise if noise else float("inf")
 
 
+def moved(fitted: Fitted, accepted: FloatArray | None) -> float:
+    """Return how far a fit takes the machine from what was accepted: squares of relative changes.
+
+    0 where that is not known.
+    """
+    if accepted is None:
+        return 0.0
+    hypothesis = fitted.hypothesis
+    off = (hypothesis.base - accepted) / hypothesis.machine.scales
+    counted = [
+        not n.endswith(".offset") and n not in hypothesis.off for n in hypothesis.machine.names
+    ]
+    return float(np.sum(np.minimum(off[counted] ** 2, 1.0)))
+
+
 def axis_power(parts: Parts, axis: int) -> float:
     """Sum of squares of the weighted errors of one axis."""
     return sum(
@@ -65,6 +80,17 @@ def expected_noise(parts: Parts, axis: int) -> float:
         for lines, _ in parts
         if lines.span.periods > 1
     )
+
+
+def relative_errors(parts: Parts) -> FloatArray:
+    """Return power of the error over power of the torque in the band, of each axis, (M,)."""
+    lost = whole = 0.0
+    for lines, values in parts:
+        counted = lines.weight > 0
+        both = values.reshape(2, *lines.weight.shape) / np.where(counted, lines.weight, np.inf)
+        lost = lost + np.sum(both**2, axis=(0, 1))
+        whole = whole + np.sum(np.abs(lines.raw(lines.motion.torque)) ** 2, axis=0)
+    return np.asarray(lost / np.maximum(whole, 1e-300))
 
 
 def explained_torque(before: Parts, after: Parts, axis: int) -> float:

@@ -1,6 +1,6 @@
 """From a recording and a model to what can be fitted and tested."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +29,8 @@ class Prepared:
     motions: dict[str, Motion]
     simulator: Simulator
     start: Hypothesis
+    accepted: FloatArray | None = None
+    """The machine's numbers as last accepted; None where they are not known."""
 
     def context(self, hypothesis: Hypothesis) -> Context:
         """Return what start values are taken from, with the errors that a hypothesis leaves."""
@@ -117,7 +119,7 @@ def reweighted(prepared: Prepared, hypothesis: Hypothesis) -> Prepared:
             )
         )
     simulator = Simulator(prepared.motions, tuple(lines))
-    return Prepared(prepared.recording, prepared.spans, prepared.motions, simulator, prepared.start)
+    return replace(prepared, simulator=simulator)
 
 
 def _from(courses: list[FloatArray], start: int, rows: int) -> list[FloatArray]:

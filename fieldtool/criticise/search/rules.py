@@ -24,6 +24,10 @@ KNOWN_WELL = 0.33
 """Largest relative standard error of the number that says how strong a cause is."""
 ALIKE_T = 2.0
 """Rivals whose difference on unseen data is below this many standard errors are a tie."""
+ALIKE_SHARE = 0.025
+"""Of what is explained: forms of effects are not so sure that less would tell rivals apart."""
+STAYED, LESS_MOVED = 1e-3, 4.0
+"""Sum of squares of the machine's relative changes that says nothing; ratio of two that does."""
 FAMILIES = (
     frozenset({"viscous_friction", "coulomb_friction", "stribeck_friction", "asymmetric_friction"}),
     frozenset({"backlash", "hardening_spring", "softening_spring", "structural_damping",

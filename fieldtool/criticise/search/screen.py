@@ -1,7 +1,7 @@
 """What each candidate could gain, by its linear part: cheap, so that only the best are fitted."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,8 @@ from fieldtool.criticise.search.hypothesis import Hypothesis, Simulator
 FloatArray = NDArray[np.float64]
 MOST_OF_IT = (0.0, 2.0)
 """Bounds of how much of a start value's torque the data may ask for."""
+NEARBY, MODE_STEP, DAMPINGS = 7, 0.12, (0.01, 0.06)
+"""Frequencies tried about the best mode, their reach over it, and damping ratios."""
 SMALLEST_PART = 0.02
 """Of a start value, that is left of it at least."""
 
@@ -70,7 +72,24 @@ def screened(
         one = _screen(simulator, at, effect)
         if one is not None and (effect.key not in best or one.gain > best[effect.key].gain):
             best[effect.key] = one
+    for one in [b for b in best.values() if b.effect.name == "extra_mode" and b.gain > 0.0]:
+        for effect in _nearby_modes(one.effect):
+            near = _screen(simulator, at, effect)
+            if near is not None and near.gain > best[effect.key].gain:
+                best[effect.key] = near
     return sorted(best.values(), key=lambda s: -s.gain)
+
+
+def _nearby_modes(effect: Effect) -> list[Effect]:
+    """Return the same mode at frequencies nearby, and with less and more damping."""
+    out = []
+    mass, frequency, damping = effect.parameters
+    for f in np.linspace(-1.0, 1.0, NEARBY):
+        for ratio in DAMPINGS:
+            start = frequency.clipped(frequency.start * (1.0 + MODE_STEP * float(f)))
+            moved = replace(frequency, start=start), replace(damping, start=ratio)
+            out.append(replace(effect, parameters=(mass, *moved)))
+    return out
 
 
 def _screen(simulator: Simulator, at: Tangent, effect: Effect) -> Screened | None:

@@ -15,13 +15,24 @@ from fieldtool.criticise.search.afterwards import (
     place_of,
     pruned,
     tied,
+    unharmful,
     unsigned,
 )
 from fieldtool.criticise.search.fit import Fitted, fit, strain
 from fieldtool.criticise.search.hypothesis import Hypothesis, Simulator
-from fieldtool.criticise.search.judge import Parts, beyond_noise, difference, judged
+from fieldtool.criticise.search.judge import Parts, beyond_noise, difference, judged, moved
 from fieldtool.criticise.search.prepare import Prepared, reweighted
-from fieldtool.criticise.search.rules import ALIKE_T, BEYOND_NOISE, RELATED, Tried, related, why_not
+from fieldtool.criticise.search.rules import (
+    ALIKE_SHARE,
+    ALIKE_T,
+    BEYOND_NOISE,
+    LESS_MOVED,
+    RELATED,
+    STAYED,
+    Tried,
+    related,
+    why_not,
+)
 from fieldtool.criticise.search.screen import Screened, Tangent, screened, tangent
 
 FloatArray = NDArray[np.float64]
@@ -79,6 +90,7 @@ def search(
         cause is looked for from there, too.
     """
     advance("fit the machine without effects", 0.0)
+    prepared = replace(prepared, accepted=accepted_base)
     prepared, before = settled(prepared, prepared.start)
     starts = [before.hypothesis]
     if accepted_base is not None and _elsewhere(before.hypothesis, accepted_base):
@@ -102,9 +114,10 @@ def search(
     advance("check the causes against each other", 0.9)
     current, accepted = pruned(prepared, current, accepted, rejected)
     current, accepted = tied(prepared, current, accepted)
+    before = fit(prepared.simulator, before.hypothesis)
+    current, accepted = unharmful(prepared, before, current, accepted, rejected)
     names = {a.tried.effect.key for a in accepted}
     names |= {t.effect.key for a in accepted for t in a.ties}
-    before = fit(prepared.simulator, before.hypothesis)
     current = current if accepted else before
     final = _on_all_rows(prepared, current) if accepted else before
     advance("done", 1.0)
@@ -191,7 +204,7 @@ def _round(
             fitted = fit(simulator, _grown(start, one), shared=at.of_machine)
             key = one.effect.key
             if key not in best or fitted.cost < best[key].fitted.cost:
-                best[key] = judged(simulator, fitted, one.effect, unseen)
+                best[key] = judged(simulator, fitted, fitted.hypothesis.effects[-1], unseen)
     tried = list(best.values())
     good = []
     for candidate in tried:
@@ -206,7 +219,7 @@ def _round(
         if not why:
             signed.append(candidate)
     if signed:
-        return [_winner(simulator, signed, rejected)], looked
+        return [_winner(prepared, signed, rejected)], looked
     return _pair(prepared, context, current, accepted, at, chosen[:PAIRED], unseen), looked
 
 
@@ -252,8 +265,13 @@ def _grown(hypothesis: Hypothesis, one: Screened) -> Hypothesis:
     return replace(grown, values=(*grown.values[:-1], one.start))
 
 
-def _winner(simulator: Simulator, tried: Sequence[Tried], rejected: Reasons) -> Accepted:
-    """Return the best on unseen data, or a simpler one that does as well; the others are its rivals."""
+def _winner(prepared: Prepared, tried: Sequence[Tried], rejected: Reasons) -> Accepted:
+    """Return the best on unseen data; the others are its rivals.
+
+    Of those that do as well, the delay goes first, then a simpler one that is contained, then the one
+    that leaves the machine as it was accepted.
+    """
+    simulator = prepared.simulator
     order = sorted(tried, key=lambda t: t.gain.after)
     best = order[0]
     for other in order[1:]:
@@ -274,8 +292,27 @@ def _winner(simulator: Simulator, tried: Sequence[Tried], rejected: Reasons) -> 
             why = f"does no better than {other.effect.name}"
             rejected[best.effect.key] = (best.effect, why)
             best = other
+    if best.effect.name != "measurement_delay":
+        best = _least_moved(prepared, order, best)
     rivals = tuple(t for t in tried if t is not best and not _nested(t.effect, best.effect))
     return Accepted(best, rivals)
+
+
+def _least_moved(prepared: Prepared, tried: Sequence[Tried], best: Tried) -> Tried:
+    """Return what explains as much as the best, but takes the machine far less from what it was."""
+    first = best
+    for other in tried:
+        if _nested(other.effect, first.effect) or other is first:
+            continue
+        lost = other.gain.after - first.gain.after
+        alike = (
+            lost < ALIKE_SHARE * (first.gain.before - first.gain.after)
+            or difference(prepared.simulator, other.fitted, first.fitted).t < ALIKE_T
+        )
+        there = moved(best.fitted, prepared.accepted)
+        if alike and there > STAYED and moved(other.fitted, prepared.accepted) < there / LESS_MOVED:
+            best = other
+    return best
 
 
 def _pair(
@@ -295,7 +332,7 @@ def _pair(
             continue
         grown = _grown(_grown(current.hypothesis, one), other)
         fitted = fit(simulator, grown, shared=at.of_machine)
-        both = [judged(simulator, fitted, s.effect, unseen) for s in (one, other)]
+        both = [judged(simulator, fitted, e, unseen) for e in fitted.hypothesis.effects[-2:]]
         if any(_why_not(prepared, context, accepted, t) for t in both):
             continue
         missed = [

@@ -25,14 +25,17 @@ from scipy.stats import t as student
 from fieldtool.criticise.evidence.lines import Lines
 
 FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
 BLOCK = 0.2
 """s: shortest block."""
 FEWEST, MOST = 12, 400
 """Blocks altogether."""
 FALLEN = 0.1
 """Of its value at zero: by how much the spectrum of the blocks may fall, on average over the waves."""
-FEWEST_WAVES, MOST_WAVES = 4, 0.5
-"""Waves at least; over the number of blocks at most."""
+FEWEST_WAVES, FEWEST_OF_MANY, MOST_WAVES = 4, 2, 0.5
+"""Waves at least, in one stretch and in each of many; over the number of blocks at most."""
+SHORTEST = 6
+"""Blocks of a stretch that stands for itself."""
 TINY = 1e-9
 """Of the spread of the blocks: the least standard error of their mean."""
 Parts = Sequence[tuple[Lines, FloatArray]]
@@ -58,8 +61,8 @@ def compared(before: Parts, after: Parts) -> Comparison:
     seconds = sum((lines.span.stop - lines.span.start) * lines.motion.step for lines, _ in before)
     blocks = int(np.clip(seconds / BLOCK, FEWEST, MOST))
     length = max(2, total // blocks)
-    gains: list[float] = []
-    sizes: list[float] = []
+    gains: list[FloatArray] = []
+    shares: list[FloatArray] = []
     sums = [0.0, 0.0]
     for (lines, first), (_, second) in zip(before, after, strict=True):
         squares = [np.sum(lines.in_time(v) ** 2, axis=1) for v in (first, second)]
@@ -67,41 +70,73 @@ def compared(before: Parts, after: Parts) -> Comparison:
             sums[k] += float(squares[k].sum())
         difference = squares[0] - squares[1]
         count = max(1, round(difference.size / length))
-        gains += [float(part.sum()) for part in np.array_split(difference, count)]
         both = squares[0] + squares[1]
-        sizes += [float(part.sum()) for part in np.array_split(both, count)]
-    t, p = chance(np.array(gains))
-    t_relative, p_relative = chance(np.array(gains) / np.maximum(np.array(sizes), 1e-300))
+        size = np.array([part.sum() for part in np.array_split(both, count)])
+        gains.append(np.array([part.sum() for part in np.array_split(difference, count)]))
+        shares.append(gains[-1] / np.maximum(size, 1e-300))
+    t, p = chance(*gains)
+    t_relative, p_relative = chance(*shares)
+    count = sum(g.size for g in gains)
     if sums[1] >= sums[0]:
-        return Comparison(sums[0], sums[1], min(t, 0.0), 1.0, len(gains))
-    return Comparison(
-        sums[0], sums[1], max(t, t_relative), min(1.0, 2 * min(p, p_relative)), len(gains)
-    )
+        return Comparison(sums[0], sums[1], min(t, 0.0), 1.0, count)
+    chances = min(1.0, 2 * min(p, p_relative))
+    return Comparison(sums[0], sums[1], max(t, t_relative), chances, count)
 
 
-def chance(gains: FloatArray) -> tuple[float, float]:
-    """Return t and one-sided p of a mean above zero, for values that may be correlated in order."""
-    n = gains.size
-    spread = float(np.std(gains, ddof=1)) if n > 1 else 0.0
+def chance(*gains: FloatArray) -> tuple[float, float]:
+    """Return t and one-sided p of a mean above zero, for values that may be correlated in order.
+
+    Each argument holds the values of one stretch.  Their means may differ (an effect may show in one
+    experiment and not in another), so only what varies within a stretch counts as chance.
+    """
+    parts = _long_enough(gains)
+    n = sum(part.size for part in parts)
+    whole = np.concatenate(parts) if parts else np.zeros(0)
+    spread = float(np.std(whole, ddof=1)) if n > 1 else 0.0
     if n < 3 or spread == 0.0:
         return 0.0, 1.0
-    waves = min(n - 1, _waves(gains))
-    number, place = np.arange(1, waves + 1)[:, None], np.arange(n) + 0.5
-    sizes = np.sqrt(2.0 / n) * np.cos(np.pi * number * place / n) @ gains
-    error = max(float(np.sqrt(np.mean(sizes**2) / n)), TINY * spread)
-    t = float(gains.mean()) / error
-    return t, float(student.sf(t, waves))
+    waves = _waves(parts)
+    powers = np.array([_slow_power(g, w) for g, w in zip(parts, waves, strict=True)])
+    variances = np.array([g.size for g in parts]) * powers / n**2
+    variance = max(float(variances.sum()), (TINY * spread) ** 2)
+    freedom = max(float(variances.sum() ** 2 / max(np.sum(variances**2 / waves), 1e-300)), 1.0)
+    t = float(whole.mean()) / float(np.sqrt(variance))
+    return t, float(student.sf(t, freedom))
 
 
-def _waves(gains: FloatArray) -> int:
-    """Return how many slow waves have the size that the slowest of all would have.
+def _long_enough(gains: Sequence[FloatArray]) -> list[FloatArray]:
+    """Join short stretches with those before them."""
+    parts: list[FloatArray] = []
+    for one in gains:
+        if parts and min(one.size, parts[-1].size) < SHORTEST:
+            parts[-1] = np.concatenate([parts[-1], one])
+        else:
+            parts.append(one)
+    return parts
+
+
+def _slow_power(gains: FloatArray, waves: int) -> float:
+    """Mean power of the slowest waves over some values."""
+    number, place = np.arange(1, waves + 1)[:, None], np.arange(gains.size) + 0.5
+    shape = np.sqrt(2.0 / gains.size) * np.cos(np.pi * number * place / gains.size)
+    return float(np.mean((shape @ gains) ** 2))
+
+
+def _waves(parts: Sequence[FloatArray]) -> IntArray:
+    """Return for each stretch how many slow waves have the size that the slowest of all would have.
 
     The spectrum of values with correlation r is that at zero over 1 + r w^2 / (1 - r)^2 for small w.
     """
-    n = gains.size
-    centred = gains - gains.mean()
-    r = float(np.sum(centred[1:] * centred[:-1]) / np.sum(centred**2))
+    centred = [g - g.mean() for g in parts]
+    n = sum(g.size for g in parts)
+    both = sum(float(np.sum(c[1:] * c[:-1])) for c in centred)
+    r = both / max(sum(float(np.sum(c**2)) for c in centred), 1e-300)
     # A correlation from few values comes out too small by about (1 + 3 r) / n.
-    r = float(np.clip(r + (1.0 + 3.0 * max(r, 0.0)) / n + 1.0 / np.sqrt(n), 1e-3, 0.95))
+    r += (1.0 + 3.0 * max(r, 0.0)) * len(parts) / n + 1.0 / np.sqrt(n)
+    r = float(np.clip(r, 1e-3, 0.95))
     highest = np.sqrt(3.0 * FALLEN / r) * (1.0 - r)
-    return int(np.clip(highest * n / np.pi, FEWEST_WAVES, MOST_WAVES * n))
+    fewest = FEWEST_WAVES if len(parts) == 1 else FEWEST_OF_MANY
+    sizes = np.array([g.size for g in parts])
+    most = np.maximum(np.minimum(MOST_WAVES * sizes, sizes - 1), 1)
+    wanted = np.maximum(highest * sizes / np.pi, fewest)
+    return np.asarray(np.minimum(wanted, most), dtype=np.int64)

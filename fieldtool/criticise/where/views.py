@@ -20,6 +20,8 @@ STRETCH = 0.5
 """s: rows that lie this close together serve the same purpose."""
 SPEEDS = 8
 """Bins of the speed in each direction."""
+HELD = 1e-3
+"""Of a course's power: pulls its size to zero where the data say little of it."""
 LARGE = 0.9
 """Quantile of the torque's size from which it is large."""
 
@@ -87,10 +89,11 @@ def _share(context: Context, axis: int, courses: Sequence[FloatArray]) -> float:
     A = A[:, scale > 0] / scale[scale > 0]
     if not A.shape[1]:
         return 0.0
-    left = 0.0
+    left, held = 0.0, HELD * np.eye(A.shape[1])
     for fold in (0, 1):
         seen = half == fold
-        solved = np.linalg.lstsq(A[seen], b[seen], rcond=1e-8)[0]
+        # A course that one half hardly has must not be guessed for the other one.
+        solved = np.linalg.solve(A[seen].T @ A[seen] + held, A[seen].T @ b[seen])
         left += float(np.sum((b[~seen] - A[~seen] @ solved) ** 2))
     return max(0.0, 1.0 - left / max(float(b @ b), 1e-300))
 
