@@ -165,7 +165,7 @@ def _key(names: Sequence[str], one: Cause | Rival) -> Key:
 def _with(prepared: Prepared, current: Fitted, key: Key) -> Fitted:
     """Fit one more effect, from its best start."""
     hypothesis = current.hypothesis
-    pool = [e for e in candidates(prepared.context(hypothesis)) if e.key == key]
+    pool = [e for e in candidates(prepared.context(hypothesis)) if e.key[:4] == key]
     if not pool:
         raise NotEnoughDataError(
             f"{key[0]} of {prepared.recording.names[key[1]]} can not be tried on this recording, "
