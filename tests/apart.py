@@ -314,7 +314,8 @@ class MachineApart:
 
         with output.open("wb") as file:
             popen = subprocess.Popen(
-                [sys.executable, "-m", "fieldtool", *words],
+                [sys.executable, "-c", _TOOL, *words],
+                cwd=Path(__file__).parents[1],
                 stdin=subprocess.DEVNULL,
                 stdout=file,
                 stderr=subprocess.STDOUT,
@@ -359,8 +360,14 @@ def _run_tool(arguments: Sequence[str], output: str, environment: Mapping[str, s
     for descriptor in (1, 2):
         os.dup2(file, descriptor)
     from fieldtool.cli.main import main
+    from tests.untried import untried
 
+    untried()
     main(arguments)
+
+
+_TOOL = "import tests.untried as u; u.untried(); from fieldtool.cli.main import main; main()"
+"""The tool as a process, its writes untried: these tests are about the write, and in real time."""
 
 
 def is_download(message: can.Message) -> bool:

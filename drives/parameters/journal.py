@@ -5,7 +5,7 @@ write has come, and what its non-volatile memory is known to hold.  It is saved 
 that it names (:meth:`Journal.began`) and after it (:meth:`Journal.ended`), so whoever reads it
 after a power cut knows what may have happened.  :func:`next_step` is the whole strategy::
 
-    new:  write all, check all, store all, check all, finish
+    new:  write all, check all, (prove,) store all, check all, finish
     old:  bring all back in working memory, store back what was or may be stored, finish
 
 A write that fails turns back (:meth:`Journal.turned_back`); one that was cut off is always taken

@@ -25,6 +25,8 @@ Save = Callable[[Journal], None]
 """Brings a journal to the disk before it returns."""
 Tell = Callable[[Step], None]
 """Is told which step begins."""
+Prove = Callable[[], None]
+"""Tries the new values in all drives' working memory, before anything is stored; raises if they fail."""
 ROUNDS = 3
 """Times that everything is brought back at most, where drives lose their supply meanwhile."""
 
@@ -49,6 +51,9 @@ class Transaction:
         Is given the journal before and after each step; an OSError ends the write.
     tell
         Is told which step begins.
+    prove
+        Called once all drives hold the new values and have been read back, before one of them stores:
+        what it raises takes the write back.  The journal is open meanwhile.
     """
 
     def __init__(
@@ -58,8 +63,9 @@ class Transaction:
         backup: Backup,
         save: Save,
         tell: Tell = lambda _: None,
+        prove: Prove | None = None,
     ) -> None:
-        self._tell = tell
+        self._tell, self._prove = tell, prove
         self._drives = {drive.axis: drive for drive in drives}
         self._backups = {part.axis: part for part in backup.drives}
         self._save = save
@@ -81,7 +87,8 @@ class Transaction:
         OSError
             If the journal could not be saved before the first write; nothing was written.
         WriteBackError
-            If a drive refused or holds another value: all drives hold their old values.
+            If a drive refused or holds another value, or the new ones were not proven: all drives hold
+            their old values.
         WriteBackMixedError
             If the old values could not be brought back either; says which drive holds what.
         """
@@ -89,12 +96,22 @@ class Transaction:
             self._save(self.journal)
             self._begun = True
             while (step := next_step(self.journal)) is not None:
+                if step.action in (Action.STORE, Action.FINISH):
+                    self._prove_once()
                 self._step_forward(step)
         except BaseException as error:
             if self.journal.is_open:
                 self._take_back(error)
             error.add_note(f"{_ENDED_WORDS[self.journal.state.value]}")
             raise
+
+    def _prove_once(self) -> None:
+        """Have the new values tried, and see that they are still there afterwards."""
+        prove, self._prove = self._prove, None
+        if prove is not None:
+            prove()
+            for drive in self._drives.values():
+                self._check(drive)
 
     def _step_forward(self, step: Step) -> None:
         self._tell(step)
@@ -171,6 +188,14 @@ class Transaction:
         with uninterrupted():
             self._back_again(self.journal.turned_back(distrust=False), whole=False)
         reason = str(cause).rstrip(".") or type(cause).__name__
+        try:
+            self._refuse_or_say(reason, cause)
+        except DrivesError as error:
+            for note in getattr(cause, "__notes__", ()):  # such as a drive that may still be enabled
+                error.add_note(note)
+            raise
+
+    def _refuse_or_say(self, reason: str, cause: BaseException) -> None:
         self._refuse_mixed(f"writing failed: {reason}. Not everything could be restored", cause)
         failed = self._begun if isinstance(cause, OSError) else not isinstance(cause, StoppedError)
         if failed and isinstance(cause, DrivesError | OSError):

@@ -94,6 +94,13 @@ Out = Annotated[
     Path | None, typer.Option("--out", help="Session folder; a new one in sessions/ otherwise.")
 ]
 Yes = Annotated[bool, typer.Option("--yes", help="Do not ask before moving and writing.")]
+Verify = Annotated[
+    bool,
+    typer.Option(
+        "--verify/--no-verify",
+        help="Try old and new parameters on the machine by small moves; what fails is taken back.",
+    ),
+]
 Store = Annotated[
     bool, typer.Option("--store", help="Keep the new parameters in non-volatile memory too.")
 ]
@@ -130,6 +137,7 @@ class _StoppableScreen:
         self._screen, self._key = screen, key
         self.say, self.plan, self.progress = screen.say, screen.plan, screen.progress
         self.ready, self.found, self.designed = screen.ready, screen.found, screen.designed
+        self.verified = screen.verified
         self.fast_plan = screen.fast_plan
 
     def stage(self, title: str) -> None:
@@ -150,6 +158,7 @@ def _options(
     motor: str,
     seconds: float | None = None,
     trace: Path | None = None,
+    verify: bool = True,
 ) -> workflow.Options:
     if plan not in ("classic", "fast"):
         raise typer.BadParameter(f"no plan is called {plan!r}; there are: fast, classic")
@@ -166,7 +175,14 @@ def _options(
         store=store,
         motor_inertia="measured" if motor == "measured" else "data sheet",
         trace=trace,
+        verify=_tried(verify, store),
     )
+
+
+def _tried(verify: bool, store: bool) -> bool:
+    if store and not verify:
+        raise typer.BadParameter("only parameters that were tried on the machine are stored")
+    return verify
 
 
 def _asker(
@@ -198,6 +214,7 @@ def run(
     ] = False,
     yes: Yes = False,
     store: Store = False,
+    verify: Verify = True,
     motor_inertia: Motor = "measured",
     seconds: Seconds = None,
     plan_only: PlanOnly = False,
@@ -212,7 +229,7 @@ def run(
     """MOVES THE MACHINE. Measure, identify, design and, with --write, write back."""
     folder = _folder(out, machine)
     traced = trace_path(trace, trace_file, folder)
-    options = _options(plan, write, store, motor_inertia, seconds, traced)
+    options = _options(plan, write, store, motor_inertia, seconds, traced, verify)
     console = console_of(as_json)
     if plan_only:
         profile = on_bus(machine, interface, channel, bitrate)
@@ -409,21 +426,24 @@ def write(
     folder: Annotated[Path, typer.Argument(help="Session folder with a tuning.")],
     yes: Yes = False,
     store: Store = False,
+    verify: Verify = True,
     interface: Interface = None,
     channel: Channel = None,
     bitrate: Bitrate = None,
     trace: TraceWanted = False,
     trace_file: TraceFile = None,
 ) -> None:
-    """Write the session folder's tuning into the drives: backup, write, read back."""
+    """MOVES THE MACHINE. Write the session folder's tuning: backup, write, read back, try."""
     console = console_of(False)
     traced = trace_path(trace, trace_file, folder)
-    options = workflow.Options(write=True, store=store, trace=traced)
-    with stop_key() as key, TerminalScreen(console) as screen:
+    options = workflow.Options(write=True, store=store, verify=_tried(verify, store), trace=traced)
+    with stop_key() as key, TerminalScreen(console, may_move(yes)) as screen:
         stoppable = _StoppableScreen(screen, key)
         ask = _asker(console, yes, key, store)
         profile = on_bus(SessionFolder.existing(folder).profile, interface, channel, bitrate)
-        result = workflow.write(folder, options, ask, screen=stoppable, machine=profile)
+        result = workflow.write(
+            folder, options, ask, screen=stoppable, machine=profile, stop_requested=key
+        )
     show_parameters(console, result)
 
 

@@ -14,6 +14,7 @@ from rich.text import Text
 
 from fieldtool.cli.design import show_tuning
 from fieldtool.design.tuning import Tuning
+from fieldtool.design.verdict import Comparison
 from fieldtool.experiment.forecast import AxisForecast
 from fieldtool.experiment.multisine.runner import MultisineProgress
 from fieldtool.experiment.stepped.plan import SweepPlan
@@ -23,6 +24,7 @@ from fieldtool.records.model import MachineModel
 from fieldtool.report.numbers import UNITS, ModelNumber, model_numbers
 from fieldtool.workflow import SessionResult, parameter_table
 from fieldtool.workflow.planning import PlannedFast
+from fieldtool.workflow.verifying import Verified
 from fieldtool.writeback.transaction import WriteBack
 
 Ask = Callable[[str], bool]
@@ -189,6 +191,14 @@ class TerminalScreen:
         """Show why the new parameters are what they are."""
         show_tuning(self.console, tuning)
 
+    def verified(self, result: Verified) -> None:
+        """Show old, predicted and new figures on one scale."""
+        self._close()
+        self.console.print(verification_table(result.axes))
+        words = {"verified": "The new parameters stand their trial.", "restored": ""}
+        if words.get(result.verdict):
+            self.console.print(Text(f"  {words[result.verdict]}"))
+
     def _close(self) -> None:
         if self._bar is not None:
             self._bar.stop()
@@ -328,3 +338,30 @@ def parameter_table_of(write_back: WriteBack, width: int) -> Table:
     """Return old and new parameters, in the drives' own units too where the terminal is wide enough."""
     raw = {(c.axis, c.name): (c.before_raw, c.after_raw) for c in write_back.changes}
     return parameter_rows(parameter_table(write_back), raw if width >= WIDE else None)
+
+
+_FIGURES = (
+    ("settles in", "settling_time", "s"),
+    ("overshoot", "overshoot", ""),
+    ("vibration after", "vibration", ""),
+    ("following error", "following_error", ""),
+    ("sensitivity peak", "sensitivity_peak", None),
+)
+
+
+def verification_table(axes: Sequence[Comparison]) -> Table:
+    """Return each axis' figures before, as predicted, and after the write."""
+    table = Table(box=None, padding=(0, 1))
+    for title in ("axis", "figure", "before", "predicted", "after", "unit"):
+        _column(table, title, words=title in ("axis", "figure", "unit"))
+    for one in axes:
+        for title, name, unit in _FIGURES:
+            cells = [
+                ""
+                if figures is None or (value := getattr(figures, name)) is None
+                else f"{value:.3g}"
+                for figures in (one.before, one.predicted, one.after)
+            ]
+            shown = {"s": "s", "": one.unit, None: ""}[unit]
+            _add(table, one.axis, title, *cells, shown)
+    return table

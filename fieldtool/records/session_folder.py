@@ -168,6 +168,16 @@ class SessionFolder:
         return self.path / "write-journal.yaml"
 
     @property
+    def verification(self) -> Path:
+        """What new parameters did on the machine, against the old ones and the prediction."""
+        return self.path / "verification.yaml"
+
+    @property
+    def verification_picture(self) -> Path:
+        """Moves and sensitivities before, predicted and after."""
+        return self.path / "verification.png"
+
+    @property
     def events(self) -> Path:
         """What happened, one JSON object a line."""
         return self.path / "events.jsonl"

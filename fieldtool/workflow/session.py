@@ -5,7 +5,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 import yaml
 
@@ -28,6 +28,9 @@ from fieldtool.records.yaml_file import write_yaml
 from fieldtool.workflow.planning import PlannedFast
 from fieldtool.writeback.transaction import WriteBack
 from fieldtool.writeback.unfinished import refuse_unfinished
+
+if TYPE_CHECKING:
+    from fieldtool.workflow.verifying import Verified
 
 PlanName = Literal["classic", "fast"]
 
@@ -59,6 +62,9 @@ class Screen(Protocol):
     def designed(self, tuning: Tuning) -> None:
         """New parameters were designed; nothing was written."""
 
+    def verified(self, result: "Verified") -> None:
+        """New parameters were tried on the machine; those that did not stand it are taken back."""
+
 
 class Quiet:
     """A screen that shows nothing."""
@@ -88,6 +94,9 @@ class Quiet:
     def designed(self, tuning: Tuning) -> None:
         """Show nothing."""
 
+    def verified(self, result: "Verified") -> None:
+        """Show nothing."""
+
 
 @dataclass(frozen=True)
 class Options:
@@ -98,6 +107,8 @@ class Options:
     """Seconds of excitation that the fast plan may take; its own choice where None."""
     write: bool = False
     store: bool = False
+    verify: bool = True
+    """Try old and new parameters on the machine when they are written; without, nothing is stored."""
     motor_inertia: Literal["measured", "data sheet"] = "measured"
     trace: Path | None = None
     """File that every frame of the session is noted in; none where it is None."""
@@ -125,6 +136,8 @@ class SessionResult:
     warnings: tuple[str, ...]
     criticism: Criticism | None = None
     """What the simulation gets wrong; None where the data did not allow a criticism."""
+    verification: "Verified | None" = None
+    """What the trial of the new parameters showed; None where nothing was written or tried."""
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values, as ``--json`` prints them."""
@@ -134,6 +147,7 @@ class SessionResult:
             "truth": self.truth.as_dict() if self.truth else None,
             "time": {"machine_s": self.machine_time, "wall_s": self.wall_time},
             "parameters": parameter_table(self.write_back),
+            "verification": self.verification.as_dict() if self.verification else None,
             "warnings": list(self.warnings),
             "folder": str(self.folder),
         }

@@ -9,21 +9,20 @@ import numpy as np
 
 from drives.bus import not_imitated
 from drives.canopen_drive import CanopenGroup, connect
-from drives.errors import NotSupportedError, ProfileError, UserStopError
+from drives.errors import ProfileError, UserStopError
 from drives.parameters import Change
 from drives.profile import MachineProfile, load_machine
 from fieldtool.design.tuning import Tuning
 from fieldtool.design.tuning_file import read_tuning
 from fieldtool.errors import (
     FieldtoolError,
-    FileFormatError,
     NotEnoughDataError,
 )
 from fieldtool.frf.response import ModelBand, save_responses
 from fieldtool.identify.likelihood.model_band import relative_std
 from fieldtool.identify.recorded import Identified, identify_recording
 from fieldtool.records.model import Estimate, MachineModel
-from fieldtool.records.model_file import write_model
+from fieldtool.records.model_file import read_model, write_model
 from fieldtool.records.recording import (
     load,
 )
@@ -49,10 +48,10 @@ from fieldtool.workflow.session import (
     SessionResult,
     never,
     open_session,
-    parameter_table,
 )
+from fieldtool.workflow.writing import written
 from fieldtool.writeback.restoring import Restored, bring_back, source_of
-from fieldtool.writeback.transaction import WriteBack, apply, changes_for
+from fieldtool.writeback.transaction import WriteBack
 
 BAND_POINTS = 400
 """Frequencies at which the band of the model's response is kept."""
@@ -112,7 +111,16 @@ def run(
                 raise UserStopError(
                     "stopped by the user before anything was written; no axis was moving"
                 )
-            write_back = _write(session, group, tuning, options, confirm)
+            write_back, verification = written(
+                session,
+                group,
+                tuning,
+                options,
+                confirm,
+                model,
+                believed=True,
+                ask_to_move=False,
+            )
     except BaseException:
         if opened is not None and opened.folder.recording.is_file():
             with suppress(Exception):  # nothing may hide why it ended
@@ -130,6 +138,7 @@ def run(
         time.perf_counter() - begin,
         tuple(session.warnings),
         criticism,
+        verification,
     )
 
 
@@ -218,10 +227,12 @@ def write(
     *,
     screen: Screen | None = None,
     machine: MachineProfile | None = None,
+    stop_requested: Callable[[], bool] = never,
 ) -> WriteBack:
-    """Write a session folder's tuning into the machine's drives.
+    """Write a session folder's tuning into the machine's drives, and try it on the machine.
 
     ``machine`` is the session's own profile, on another bus if need be; the folder's where None.
+    Old and new parameters move the machine a little (``Options.verify``).
 
     Raises
     ------
@@ -231,10 +242,15 @@ def write(
     folder = SessionFolder.existing(folder_path)
     tuning = read_tuning(folder.needed(folder.tuning, "`fieldtool design` on this folder"))
     profile = machine or folder.machine
-    with open_session(profile, folder_path, screen, never, True, "write", options) as (s, group):
-        result = _write(s, group, tuning, options, confirm)
-        if result is None:
-            raise FileFormatError(folder.tuning, "writing was not asked for")
+    with open_session(profile, folder_path, screen, stop_requested, True, "write", options) as (
+        session,
+        group,
+    ):
+        known = folder.model.is_file()
+        model = read_model(folder.model) if known else prior_model(session.machine)
+        result, _ = written(
+            session, group, tuning, options, confirm, model, believed=known, ask_to_move=True
+        )
         return result
 
 
@@ -395,36 +411,3 @@ def _band(identified: Identified) -> ModelBand | None:
 def _design(folder: SessionFolder, machine: MachineProfile, model: MachineModel) -> Tuning:
     check_known(model)
     return designed(folder, machine, model)
-
-
-def _write(
-    session: Session,
-    group: CanopenGroup,
-    tuning: Tuning,
-    options: Options,
-    confirm: Confirm,
-) -> WriteBack | None:
-    folder = session.folder
-    if not options.write:
-        try:
-            changes = changes_for(group.drives, tuning)
-        except NotSupportedError as error:  # a drive whose gains are for its maker's software
-            session.warn(str(error))
-            changes = ()
-        designed = WriteBack((), changes, in_memory=False, stored=False, backup=None)
-        folder.note("parameters", rows=parameter_table(designed))
-        return designed
-    session.screen.stage("Write the new parameters, and read them back")
-    result = apply(
-        session.machine.name,
-        group.drives,
-        tuning,
-        folder.parameters_before,
-        confirm,
-        options.store,
-        session.screen.say,
-    )
-    folder.note("parameters", rows=parameter_table(result))
-    folder.note("write", written=result.in_memory, stored=result.stored)
-    session.screen.say(result.sentence)
-    return result

@@ -87,6 +87,7 @@ def apply(
     confirm: Confirm,
     keep: bool = False,
     say: Callable[[str], None] = lambda _: None,
+    prove: Callable[[], None] | None = None,
 ) -> WriteBack:
     """Back up, show, ask, write, read back, and store if wanted: all drives or none.
 
@@ -108,6 +109,9 @@ def apply(
         Store in non-volatile memory too.
     say
         Is told which drive stores, and how long that may take.
+    prove
+        Tries the new parameters once all drives hold them in working memory; what it raises
+        (``drives.errors.NotVerifiedError``) takes the write back.  Nothing is stored before.
 
     Raises
     ------
@@ -118,7 +122,8 @@ def apply(
     OutputError
         If backup or journal can not be written; nothing was changed.
     WriteBackError
-        If a drive refused, altered a value or did not store: all drives hold their old values.
+        If a drive refused, altered a value or did not store, or the new parameters were not proven:
+        all drives hold their old values.
     WriteBackMixedError
         If not all of them could be brought back; says which drive holds what.
     """
@@ -135,7 +140,7 @@ def apply(
     journal = planned_journal(machine, drives, changes, backup_path.name, storing)
     keeper = JournalKeeper(backup_path.with_name(JOURNAL))
     backup = load_backup(backup_path)
-    transaction = Transaction(drives, journal, backup, keeper, tell_storing(drives, say))
+    transaction = Transaction(drives, journal, backup, keeper, tell_storing(drives, say), prove)
     try:
         with keeper:
             transaction.write()

@@ -21,6 +21,7 @@ from drives.sim.machine import simulated_machine
 from drives.sim.running import RunningMachine
 from fieldtool.cli.main import main
 from fieldtool.records.recording import Recording, load
+from tests.untried import Stood
 
 GAINS = {
     "position_p": 15,
@@ -331,6 +332,12 @@ def profile_of_two() -> dict[str, Any]:
 @pytest.fixture
 def profile_of_one() -> dict[str, Any]:
     return one_axis()
+
+
+@pytest.fixture
+def untried(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Writes that are not tried on the machine: for tests of the write itself."""
+    monkeypatch.setattr("fieldtool.workflow.writing.Verification", Stood)
 
 
 @pytest.fixture

@@ -118,7 +118,7 @@ def pressing_during(monkeypatch, module, name, only_call=1):
         ("measuring", "identify_recording", 1),
         ("stages", "identify_recording", 1),
         ("stages", "design", 1),
-        ("stages", "apply", 1),
+        ("writing", "apply", 1),
     ],
 )
 def test_between_measuring_and_writing(small_bench, monkeypatch, module, name, call, late):

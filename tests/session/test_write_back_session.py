@@ -20,6 +20,7 @@ from drives.sim.faults import (
     WriteAltered,
 )
 
+pytestmark = pytest.mark.usefixtures("untried")
 TABLE, ARM = 11, 12
 VELOCITY_P, VELOCITY_I, POSITION_P = (0x2010, 2), (0x2010, 3), (0x2010, 1)
 NEW = {"velocity_p": 2.0, "velocity_i": 16.0, "position_p": 20.0}

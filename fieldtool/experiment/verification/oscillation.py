@@ -235,7 +235,8 @@ class OscillationWatch:
         if abs(push) > allowed.torque[k]:
             return (
                 f"its torque went {abs(push):.3g} {torque_unit} from that at rest, above the "
-                f"{allowed.torque[k]:.3g} {torque_unit} allowed here: its loop swings or pushes"
+                f"{allowed.torque[k]:.3g} {torque_unit} allowed here: its loop swings or pushes, or "
+                "the axis is heavier than its model"
             )
         for swings, seen, what, of in (
             (self._torques[k], turned, "torque", torque_unit),

@@ -4,8 +4,8 @@ Nothing is trusted that has not been seen: the axes first stand still, then each
 its move, then each makes its move and comes back, then all are excited a little at the same time.
 """
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -33,6 +33,8 @@ NUDGE_TORQUE = 0.3
 """Share of the torque limit that a nudge may take."""
 BEYOND, BEHIND = 0.5, 0.15
 """Shares of a move by which it may be overshot, and by which the axis may go the wrong way."""
+PUSHED_ERROR = 0.3
+"""Share of its following error limit by which an axis may be pushed that does not move itself."""
 SLICE_TIME = 0.02
 """Seconds that are sent at a time."""
 
@@ -142,6 +144,7 @@ def run_trial(
     trusts_loops: bool,
     louder: FloatArray | None = None,
     report: Report = lambda _: None,
+    exciting: Callable[[], AbstractContextManager[object]] = nullcontext,
 ) -> Tried:
     """Do all of a trial where the axes stand; whatever ends it, they are stopped and disabled.
 
@@ -161,6 +164,8 @@ def run_trial(
         See :class:`OscillationWatch`.
     report
         Is told how far the excitation is.
+    exciting
+        Entered for the time of the excitation, with all drives disabled before and after.
 
     Raises
     ------
@@ -193,8 +198,9 @@ def run_trial(
                 steps.move(move)
         if trial.excitation is not None:
             there = replace(axes, centre=start)
-            exciting = _Excited(mover, watch, start, trial, still)
-            run_multisine(exciting, trial.excitation, there, kept.append, report)
+            excited = _Excited(mover, watch, start, trial, still)
+            with exciting():
+                run_multisine(excited, _named(trial.excitation, name), there, kept.append, report)
     except BaseException as error:
         keep_whatever_happens(kept, keep, error)
         raise
@@ -202,6 +208,12 @@ def run_trial(
         keep(experiment)
     noise = np.max([np.ptp(rest.torque[rest.rows // 2 :], axis=0) for rest in rests], axis=0)
     return Tried(tuple(kept), noise)
+
+
+def _named(plan: MultisinePlan, name: str) -> MultisinePlan:
+    """Return an excitation whose experiments say whose loops are tried."""
+    named = tuple(replace(one, name=f"{name}: {one.name}") for one in plan.experiments)
+    return replace(plan, experiments=named)
 
 
 class _Steps:
@@ -249,7 +261,8 @@ class _Steps:
         *,
         gentle: bool = False,
     ) -> None:
-        slack = CHECK_PUSHED * self._still
+        errors = np.array([one.following_error for one in self._axes.limits])
+        slack = np.maximum(CHECK_PUSHED * self._still, PUSHED_ERROR * errors)
         low, high = self._start - slack, self._start + slack
         slack_k = float(self._still[k])
         ends = (-BEHIND * distance, (1 + BEYOND) * distance)

@@ -1,0 +1,156 @@
+"""Whether what new parameters do on the machine is good enough to leave them in the drives.
+
+Three questions, each with a tolerance that is stated: are the margins kept, is it no worse than with the
+old parameters, is it what was predicted.  All figures of a comparison come from the same trial.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from fieldtool.design.measured import AxisFigures, Sensitivity
+
+MARGIN = 1.05
+"""Times the bound that a measured peak of sensitivity may have: what its measurement is good for."""
+SLOWER = 1.05
+"""Times the settling time with the old parameters that the new one may take."""
+CYCLES = 3.0
+"""Cycles of the bus by which times may differ besides: no time is known better."""
+RINGS = 1.5
+"""Times the old vibration, and the old overshoot, or those predicted, that the new ones may have; half
+the band about the target counts as nothing."""
+PEAK_OFF = 0.2
+"""Share by which a measured peak of sensitivity may be off the predicted one."""
+CURVE_OFF = 0.35
+"""Natural logarithm by which the middle one of all lines' sensitivities may be off: a factor of 1.4."""
+TIME_OFF, MOVE_OFF = 0.3, 0.05
+"""Shares of the predicted settling time, and of the move's own time, by which settling may be off."""
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """One axis before, as predicted, and after; all on one scale."""
+
+    axis: str
+    unit: str
+    """Of positions."""
+    distance: float
+    """Of the move."""
+    duration: float
+    """s, of the move's reference."""
+    band: float
+    before: AxisFigures | None
+    """None where it was not measured."""
+    predicted: AxisFigures | None
+    """None where there is no model to predict from."""
+    after: AxisFigures | None
+    """None where the trial did not come that far."""
+    sensitivity_before: Sensitivity | None = None
+    sensitivity_predicted: Sensitivity | None = None
+    """At the lines of the measured one."""
+    sensitivity_after: Sensitivity | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values."""
+        figures = {
+            name: figure.as_dict() if (figure := getattr(self, name)) else None
+            for name in ("before", "predicted", "after")
+        }
+        curves = {
+            name: curve.as_dict() if (curve := getattr(self, f"sensitivity_{name}")) else None
+            for name in ("before", "predicted", "after")
+        }
+        move = {"distance": self.distance, "duration": self.duration, "band": self.band}
+        return {
+            "axis": self.axis,
+            "unit": self.unit,
+            "move": move,
+            **figures,
+            "sensitivity": curves,
+        }
+
+
+def faults(one: Comparison, cycle: float, bound: float, *, believed: bool) -> tuple[str, ...]:
+    """Return what is wrong with an axis' new parameters, a sentence each; empty if nothing is.
+
+    Parameters
+    ----------
+    one
+        Of the axis.
+    cycle
+        Of the bus, s.
+    bound
+        That was designed for: of the peak of sensitivity.
+    believed
+        Whether the prediction rests on an identified model; it is not judged by where it does not.
+    """
+    after = one.after
+    if after is None:
+        return (f"{one.axis}: was not measured with the new parameters",)
+    found = _margins(one, after, bound)
+    if one.before is not None:
+        found += _worse(one, one.before, after, cycle)
+    if one.predicted is not None and believed:
+        found += _unlike(one, one.predicted, after, cycle)
+    return tuple(f"{one.axis}: {text}" for text in found)
+
+
+def _margins(one: Comparison, after: AxisFigures, bound: float) -> list[str]:
+    found = []
+    if not np.isfinite(after.settling_time):
+        found.append(
+            f"does not settle: it is outside of ±{one.band:.3g} {one.unit} at the end of the record"
+        )
+    peak = after.sensitivity_peak
+    if peak is not None and peak > MARGIN * bound:
+        found.append(
+            f"its peak of sensitivity is {peak:.3g} at {after.sensitivity_frequency:.3g} Hz, "
+            f"{bound:.3g} was wanted and up to {MARGIN * bound:.3g} is taken"
+        )
+    return found
+
+
+def _worse(one: Comparison, before: AxisFigures, after: AxisFigures, cycle: float) -> list[str]:
+    found = []
+    longest = SLOWER * before.settling_time + CYCLES * cycle
+    if after.settling_time > longest and np.isfinite(after.settling_time):
+        found.append(
+            f"settles in {after.settling_time:.3g} s after its move, {before.settling_time:.3g} s with "
+            f"the old parameters; {100 * (SLOWER - 1):.0f} % more is taken"
+        )
+    for what, name in (("overshoots", "overshoot"), ("vibrates after its move", "vibration")):
+        new, old = getattr(after, name), getattr(before, name)
+        expected = getattr(one.predicted, name) if one.predicted else 0.0
+        if new > RINGS * max(old, expected) + one.band / 2:
+            found.append(
+                f"{what} by {new:.3g} {one.unit}, {old:.3g} {one.unit} with the old parameters"
+            )
+    return found
+
+
+def _unlike(one: Comparison, expected: AxisFigures, after: AxisFigures, cycle: float) -> list[str]:
+    found = []
+    allowed = TIME_OFF * expected.settling_time + MOVE_OFF * one.duration + CYCLES * cycle
+    off = after.settling_time - expected.settling_time
+    if np.isfinite(after.settling_time) and np.isfinite(expected.settling_time) and off > allowed:
+        found.append(
+            f"settles in {after.settling_time:.3g} s after its move, {expected.settling_time:.3g} s was "
+            f"predicted; {allowed:.2g} s more is taken"
+        )
+    wanted, peak = expected.sensitivity_peak, after.sensitivity_peak
+    if wanted and peak and abs(peak / wanted - 1) > PEAK_OFF:
+        found.append(
+            f"its peak of sensitivity is {peak:.3g}, {wanted:.3g} was predicted; "
+            f"{100 * PEAK_OFF:.0f} % off is taken"
+        )
+    measured, predicted = one.sensitivity_after, one.sensitivity_predicted
+    if measured is not None and predicted is not None:
+        apart = float(np.median(np.abs(np.log(measured.size / predicted.size))))
+        if apart > CURVE_OFF:
+            found.append(
+                f"its sensitivity is off the predicted one by a factor of {np.exp(apart):.2g} over its "
+                f"frequencies; {np.exp(CURVE_OFF):.2g} is taken: its loop is not the one that was "
+                "designed"
+            )
+    return found

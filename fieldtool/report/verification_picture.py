@@ -1,0 +1,145 @@
+"""The trial as one PNG: each axis' move and sensitivity before, as predicted, and after."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
+
+from fieldtool.design.predict import Prediction
+from fieldtool.design.verdict import Comparison
+from fieldtool.errors import OutputError
+from fieldtool.records.model import FloatArray
+
+BEFORE, PREDICTED, AFTER, REFERENCE = "#9aa5b1", "#d1495b", "#1f3b73", "#2b2b2b"
+History = tuple[FloatArray, ...] | None
+"""Time, reference and position of a move from where it began."""
+BANDS = 12.0
+"""Half the height of the picture of the error, in bands about the target."""
+
+
+def draw_verification(
+    axes: Sequence[tuple[Comparison, History, History]], prediction: Prediction, path: Path
+) -> None:
+    """Draw move, error at its end, and sensitivity of every axis.
+
+    Parameters
+    ----------
+    axes
+        Comparison, and what was measured before and after; None where it was not.
+    prediction
+        Of the new parameters.
+    path
+        PNG file to write.
+
+    Raises
+    ------
+    OutputError
+        If the file can not be written.
+    """
+    figure = Figure(figsize=(13.5, 3.3 * len(axes) + 0.5), layout="constrained")
+    FigureCanvasAgg(figure)
+    plots = figure.subplots(len(axes), 3, squeeze=False)
+    for row, (k, (one, before, after)) in zip(plots, enumerate(axes), strict=True):
+        curves = prediction.axes[k].curves
+        foreseen: History = (
+            None if curves is None else (curves.time, curves.reference, curves.position)
+        )
+        _draw_move(row[0], one, before, foreseen, after)
+        _draw_error(row[1], one, before, foreseen, after)
+        _draw_sensitivity(row[2], one)
+    plots[0, 0].legend(loc="best", fontsize=8)
+    plots[0, 2].legend(loc="best", fontsize=8)
+    try:
+        figure.savefig(path, dpi=110)
+    except OSError as error:
+        raise OutputError(f"{path}: can not be written ({error.strerror})") from error
+
+
+def _out(history: History, one: Comparison) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+    """Return the move out alone: time, reference, position."""
+    if history is None:
+        return None
+    time, reference, position = history
+    there = np.flatnonzero(np.abs(reference) >= abs(one.distance) * (1 - 1e-9))
+    stop = int(there[-1]) + 1 if there.size else reference.size
+    return time[:stop], reference[:stop], position[:stop]
+
+
+def _parts(
+    one: Comparison, before: History, foreseen: History, after: History
+) -> list[tuple[str, str, str, tuple[FloatArray, FloatArray, FloatArray] | None]]:
+    return [
+        ("before", BEFORE, "-", _out(before, one)),
+        ("after", AFTER, "-", _out(after, one)),
+        ("predicted", PREDICTED, "--", _out(foreseen, one)),
+    ]
+
+
+def _draw_move(
+    plot: Axes, one: Comparison, before: History, foreseen: History, after: History
+) -> None:
+    parts = _parts(one, before, foreseen, after)
+    measured = next((part for _, _, _, part in parts if part is not None), None)
+    if measured is not None:
+        plot.plot(measured[0], measured[1], ":", color=REFERENCE, lw=1.0, label="reference")
+    for name, colour, style, part in parts:
+        if part is not None:
+            plot.plot(part[0], part[2], style, color=colour, lw=1.4, label=name)
+    plot.set_xlim(0, _end(one, parts))
+    plot.set_title(f"{one.axis}: move, {one.unit}", loc="left", fontsize=10)
+    plot.set_xlabel("s")
+    plot.grid(visible=True, alpha=0.25)
+
+
+def _end(
+    one: Comparison,
+    parts: list[tuple[str, str, str, tuple[FloatArray, FloatArray, FloatArray] | None]],
+) -> float:
+    ends = [float(part[0][-1]) for _, _, _, part in parts if part is not None]
+    slowest = [
+        figures.settling_time
+        for figures in (one.before, one.predicted, one.after)
+        if figures is not None and np.isfinite(figures.settling_time)
+    ]
+    wanted = one.duration + 1.5 * max([*slowest, 0.3 * one.duration])
+    return float(min([wanted, *ends]))
+
+
+def _draw_error(
+    plot: Axes, one: Comparison, before: History, foreseen: History, after: History
+) -> None:
+    parts = _parts(one, before, foreseen, after)
+    plot.axhspan(-one.band, one.band, color="#e8ecf1")
+    for name, colour, style, part in parts:
+        if part is not None:
+            plot.plot(part[0], part[2] - one.distance, style, color=colour, lw=1.2, label=name)
+    plot.axvline(one.duration, color=REFERENCE, ls=":", lw=1.0)
+    end = _end(one, parts)
+    plot.set_xlim(max(0.0, one.duration - 0.15 * end), end)
+    plot.set_ylim(-BANDS * one.band, BANDS * one.band)
+    plot.set_title(f"{one.axis}: distance from the target, {one.unit}", loc="left", fontsize=10)
+    plot.set_xlabel("s")
+    plot.grid(visible=True, alpha=0.25)
+
+
+def _draw_sensitivity(plot: Axes, one: Comparison) -> None:
+    for name, colour, style, curve in (
+        ("before", BEFORE, "-", one.sensitivity_before),
+        ("after", AFTER, "o-", one.sensitivity_after),
+        ("predicted", PREDICTED, "--", one.sensitivity_predicted),
+    ):
+        if curve is not None:
+            plot.loglog(
+                curve.frequency, curve.size, style, color=colour, lw=1.2, ms=2.5, label=name
+            )
+    plot.axhline(2.0, color=REFERENCE, ls=":", lw=1.0)
+    plot.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    plot.xaxis.set_major_formatter(FormatStrFormatter("%g"))
+    plot.xaxis.set_minor_formatter(NullFormatter())
+    plot.set_title(f"{one.axis}: sensitivity", loc="left", fontsize=10)
+    plot.set_xlabel("Hz")
+    plot.grid(visible=True, which="both", alpha=0.25)

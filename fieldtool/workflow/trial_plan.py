@@ -1,0 +1,342 @@
+"""Plan the trial of old and new parameters: one plan for both, within the limits of either."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from drives.canopen_drive import CanopenDrive, CanopenGroup
+from drives.parameters import Change, read_loop, read_parameters
+from fieldtool.design.moves import TestMove
+from fieldtool.design.predict import Prediction, predict
+from fieldtool.design.servo import Servo, servo_from_parameters
+from fieldtool.errors import PlanRefusedError
+from fieldtool.experiment.forecast import Setting
+from fieldtool.experiment.multisine.design import fast_cycle_times
+from fieldtool.experiment.verification.excitation import (
+    HIGHEST,
+    Lines,
+    expected_peaks,
+    sensitivity_plan,
+)
+from fieldtool.experiment.verification.trial import Trial, TrialMove
+from fieldtool.records.closed_loop import AxisLoop
+from fieldtool.records.model import FloatArray
+from fieldtool.workflow.design_inputs import moves_of, timing_of
+
+ROOM = 0.6
+"""Of the way to the end of the travel that a move may use: it may overshoot."""
+FEWEST_COUNTS, BAND_COUNTS = 100.0, 4.0
+"""Counts of the encoder that a move, and the band about its target, have at least."""
+KEPT = 0.7
+"""Of the limits of torque, velocity and following error that a move may take by prediction."""
+GENTLER, TIMES = 0.75, 12
+"""What is left of a move's velocity and acceleration where it takes more, and how often."""
+SWELLS, BESIDE = 1.6, 0.15
+"""Times the predicted torque, and share of the limit besides, that a move may take; never more than
+MOST of the limit, and OTHERS of it on axes that are not moved."""
+MOST, OTHERS = 0.9, 0.5
+EXCITED = 3.0
+"""Times what the excitation does by the model that it may do."""
+REST, LEAST_REST, MOST_REST = 2.0, 0.5, 6.0
+"""Times the predicted settling for which a move is watched after its end; at least, at most, s."""
+NOISE_SWINGS = 12.0
+"""Times the RMS of the torque that an encoder's steps make: by so much it may swing, peak to peak."""
+ROUNDED_TARGETS = 4.0
+"""Targets are whole counts: their second difference, a cycle squared apart, may swing by so many counts,
+peak to peak, and the inertia that is fed forward makes torque of it."""
+NOT_AS_SAID = 1.25
+"""Factor by which a peak of sensitivity may be off what the tuning says."""
+STANDSTILL_TIME, STANDSTILL_TIMEOUT = 0.25, 30.0
+STANDSTILL_COUNTS, STANDSTILL_TRAVEL = 3.0, 2e-5
+"""A disabled axis stands that moves by less than so many counts, or this share of its travel, in so many
+seconds, twice; waited for at most."""
+ACCELERATES = 0.6
+"""Share of the time to speed up below which a torque that turns back is not the move's own."""
+
+
+@dataclass(frozen=True, eq=False)
+class TrialPlan:
+    """What is tried, and what is to be expected of it."""
+
+    trial: Trial
+    lines: Lines | None
+    """Of the excitation; None where there is none."""
+    moves: tuple[TestMove, ...]
+    old: tuple[Servo, ...]
+    new: tuple[Servo, ...]
+    before: Prediction
+    after: Prediction
+    notes: tuple[str, ...]
+
+
+def wait_for_standstill(group: CanopenGroup) -> None:
+    """Wait until no disabled axis moves any more: whatever coasts or swings has to come to rest.
+
+    Raises
+    ------
+    PlanRefusedError
+        If one goes on moving.
+    """
+    still = 0
+    before = [drive.read_position() for drive in group.drives]
+    moved: list[str] = []
+    for _ in range(round(STANDSTILL_TIMEOUT / STANDSTILL_TIME)):
+        group.drives[0].wait(STANDSTILL_TIME)
+        now = [drive.read_position() for drive in group.drives]
+        moved = [
+            drive.axis
+            for drive, a, b in zip(group.drives, before, now, strict=True)
+            if abs(b - a) > STANDSTILL_COUNTS * abs(drive.scaling.position)
+            and abs(b - a) > STANDSTILL_TRAVEL * (drive.limits.travel[1] - drive.limits.travel[0])
+        ]
+        before, still = now, 0 if moved else still + 1
+        if still >= 2:
+            return
+    raise PlanRefusedError(
+        f"{', '.join(moved)}: moves although its drive is disabled. Nothing was moved or written. Does "
+        "its brake close, does something push it, or does its encoder drift?"
+    )
+
+
+def servo_of(drive: CanopenDrive, changes: Sequence[Change], cycle_time: float) -> Servo:
+    """Return the controller in a drive, with some of its parameters changed."""
+    return servo_from_parameters(_values(drive, changes), timing_of(drive.profile, cycle_time))
+
+
+def torque_steps(drive: CanopenDrive, servo: Servo, cycle_time: float) -> float:
+    """Return how far the steps of encoder and targets alone may make a torque swing, peak to peak."""
+    step = abs(drive.scaling.position)
+    rounded = ROUNDED_TARGETS * servo.loop.inertia_ff * step / cycle_time**2
+    return NOISE_SWINGS * servo.torque_noise(step) + rounded
+
+
+def _values(drive: CanopenDrive, changes: Sequence[Change]) -> Mapping[str, float]:
+    """Return the cascade's parameters in a drive, by name, after these changes."""
+    own = {change.name: change.after for change in changes if change.axis == drive.axis}
+    if not own:
+        return read_loop(drive)
+    values = dict(read_loop(drive))
+    held = read_parameters(drive) | own
+    return {**values, **drive.conversion().as_cascade(held)}
+
+
+def plan_trial(
+    group: CanopenGroup,
+    setting: Setting,
+    changes: Sequence[Change],
+    bound: float,
+    stated: Mapping[str, float],
+) -> TrialPlan:
+    """Plan moves and excitation from where the axes stand, for the old and the new parameters.
+
+    Parameters
+    ----------
+    group
+        Drives; nothing moves.
+    setting
+        Model, the loops that are in the drives now, limits.
+    changes
+        What the new parameters change.
+    bound
+        Of the peak of sensitivity that the new parameters were designed for.
+    stated
+        What that peak is by the tuning, by axis; empty where the model is not the one it was made for.
+
+    Raises
+    ------
+    PlanRefusedError
+        If the new loops are not stable by the model, or there is no room to move.
+    """
+    cycle = fast_cycle_times(setting.model, group.shortest_cycle)[0]
+    old = tuple(servo_of(drive, (), cycle) for drive in group.drives)
+    new = tuple(servo_of(drive, changes, cycle) for drive in group.drives)
+    typical = moves_of(group.machine, setting.model)
+    moves = tuple(_free_move(*pair) for pair in zip(group.drives, typical, strict=True))
+    for _ in range(TIMES):
+        before, after = (predict(setting.model, servos, moves) for servos in (old, new))
+        _check_stable(after, bound)
+        _check_as_designed(after, stated)
+        over = [_takes_too_much(setting, k, (before, after)) for k in range(len(moves))]
+        if not any(over):
+            break
+        moves = tuple(
+            replace(
+                move,
+                velocity=move.velocity * GENTLER,
+                acceleration=move.acceleration * GENTLER**2,
+                jerk=move.jerk * GENTLER**3,
+            )
+            if hard
+            else move
+            for move, hard in zip(moves, over, strict=True)
+        )
+    else:
+        raise PlanRefusedError(
+            "no move can be found that keeps all limits with the old and the new parameters; nothing "
+            "was moved or written. Widen the limits if the machine allows it, or use --no-verify."
+        )
+    limits = np.array([one.torque for one in setting.limits])
+    steps = [
+        max(torque_steps(drive, servo, cycle) for servo in (old[k], new[k]))
+        for k, drive in enumerate(group.drives)
+    ]
+    trial_moves = tuple(
+        _trial_move(move, k, cycle, limits, steps[k], (before, after))
+        for k, move in enumerate(moves)
+    )
+    plan = TrialPlan(
+        Trial(cycle, trial_moves, None, np.zeros(limits.size), np.zeros(limits.size)),
+        None,
+        moves,
+        old,
+        new,
+        before,
+        after,
+        (),
+    )
+    return _with_excitation(plan, group, setting, steps)
+
+
+def _free_move(drive: CanopenDrive, typical: TestMove) -> TestMove:
+    """Return an axis' typical move from where it stands, as far as there is room for it.
+
+    It goes its own way where that fits, else towards the farther end of the travel.
+
+    Raises
+    ------
+    PlanRefusedError
+        If there is no room.
+    """
+    limits = drive.limits
+    at = drive.read_position()
+    down, up = at - limits.travel[0], limits.travel[1] - at
+    room = {1.0: ROOM * up, -1.0: ROOM * down}
+    sign = float(np.sign(typical.distance))
+    if abs(typical.distance) > room[sign]:
+        sign = 1.0 if up >= down else -1.0
+    way = min(abs(typical.distance), room[sign])
+    counts = abs(drive.scaling.position)
+    if way < FEWEST_COUNTS * counts:
+        raise PlanRefusedError(
+            f"{drive.axis}: stands at {at:.4g} {drive.position_unit} and has no room to move. Nothing "
+            "was moved or written. Move it away from the end of its travel."
+        )
+    band = max(typical.settling_band * way / abs(typical.distance), BAND_COUNTS * counts)
+    return replace(typical, distance=sign * way, band=band)
+
+
+def _check_as_designed(after: Prediction, stated: Mapping[str, float]) -> None:
+    """Refuse parameters that are not what their tuning says of them: changed, or of another model."""
+    for axis in after.axes:
+        peak, said = axis.margins.sensitivity_peak, stated.get(axis.axis)
+        if said is not None and not 1 / NOT_AS_SAID < peak / said < NOT_AS_SAID:
+            raise PlanRefusedError(
+                f"{axis.axis}: its tuning says that the peak of sensitivity is {said:.3g}; with these "
+                f"parameters it would be {peak:.3g} by the model. Either they were changed, or the "
+                "model was. Nothing was moved or written. Design anew (`fieldtool design`)."
+            )
+
+
+def _check_stable(after: Prediction, bound: float) -> None:
+    if not after.stable:
+        raise PlanRefusedError(
+            "with the new parameters the machine would not be stable by its model. Nothing was moved "
+            "or written. Design anew (`fieldtool design`), or measure again if the machine was changed."
+        )
+    for axis in after.axes:
+        peak = axis.margins.sensitivity_peak
+        if peak > 1.2 * bound:
+            raise PlanRefusedError(
+                f"{axis.axis}: with the new parameters its peak of sensitivity would be {peak:.3g} at "
+                f"{axis.margins.peak_frequency:.3g} Hz by the model, {bound:.3g} is allowed. Nothing "
+                "was moved or written. Design anew (`fieldtool design`)."
+            )
+
+
+def _takes_too_much(setting: Setting, k: int, predictions: Sequence[Prediction]) -> bool:
+    limits = setting.limits[k]
+    for prediction in predictions:
+        one = prediction.axes[k]
+        if one.curves is None or one.move is None:
+            continue
+        speed = float(np.abs(np.gradient(one.curves.position, one.curves.time)).max())
+        if (
+            one.peak_torque > KEPT * limits.torque
+            or one.move.following_error > KEPT * limits.following_error
+            or speed > KEPT * limits.velocity
+        ):
+            return True
+    return False
+
+
+def _trial_move(
+    move: TestMove,
+    k: int,
+    cycle: float,
+    limits: FloatArray,
+    steps: float,
+    predictions: Sequence[Prediction],
+) -> TrialMove:
+    known = [one.axes[k] for one in predictions if one.axes[k].move is not None]
+    peak = max((one.peak_torque for one in known), default=0.0)
+    torque = OTHERS * limits
+    torque[k] = min(SWELLS * peak + BESIDE * limits[k] + steps / 2, MOST * limits[k])
+    settles = max(
+        (
+            one.move.settling_time
+            for one in known
+            if one.move is not None and np.isfinite(one.move.settling_time)
+        ),
+        default=MOST_REST,
+    )
+    rest = min(max(REST * settles, LEAST_REST, move.duration), MOST_REST)
+    rise, held, _ = move.parts
+    reference = move.reference(cycle)
+    return TrialMove(k, reference, round(rest / cycle), torque, ACCELERATES * (2 * rise + held))
+
+
+def _without_feed_forward(drive: CanopenDrive, servo: Servo) -> AxisLoop:
+    """Return a drive's loop with that feed-forward off that can be switched off."""
+    loop, switched = servo.loop, drive.profile.feed_forward
+    return replace(
+        loop,
+        velocity_ff=0.0 if "velocity_ff" in switched else loop.velocity_ff,
+        inertia_ff=0.0 if "inertia_ff" in switched else loop.inertia_ff,
+    )
+
+
+def _with_excitation(
+    plan: TrialPlan, group: CanopenGroup, setting: Setting, steps: Sequence[float]
+) -> TrialPlan:
+    """Add the small multisine; where it can not be planned the note says why."""
+    cycle = plan.trial.cycle_time
+    limits = np.array([one.torque for one in setting.limits])
+    highest = 0.9 * HIGHEST / cycle
+    peaks = [
+        sorted(
+            {
+                min(prediction.axes[k].margins.peak_frequency, highest)
+                for prediction in (plan.before, plan.after)
+            }
+        )
+        for k in range(limits.size)
+    ]
+    at = np.array([drive.read_position() for drive in group.drives])
+    here = [
+        replace(setting, loops=tuple(map(_without_feed_forward, group.drives, servos)), centre=at)
+        for servos in (plan.old, plan.new)
+    ]
+    try:
+        excitation, lines = sensitivity_plan(here, peaks, group.torque_offsets, cycle)
+        done = np.max([expected_peaks(excitation, one) for one in here], axis=0)
+    except PlanRefusedError as error:
+        note = f"the sensitivities are not measured: {error}"
+        return replace(plan, notes=(*plan.notes, note))
+    trial = replace(
+        plan.trial,
+        excitation=excitation,
+        excursion=EXCITED * done[0],
+        torque=np.minimum(EXCITED * done[3] + 0.05 * limits + np.array(steps) / 2, MOST * limits),
+    )
+    return replace(plan, trial=trial, lines=lines)

@@ -1,0 +1,409 @@
+"""The machine has the last word: old and new parameters are tried by the same short test.
+
+The old ones first, with what the drives hold; then, inside the write's transaction and before anything
+is stored, the new ones.  What the trial raises takes the write back.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from drives.canopen_drive import CanopenGroup
+from drives.errors import NotVerifiedError, OscillationError, StoppedError, UserStopError
+from drives.parameters import Change
+from fieldtool.design.loops import Loops
+from fieldtool.design.machine import machine_of, respond
+from fieldtool.design.measured import (
+    AxisFigures,
+    Excited,
+    Sensitivity,
+    axis_figures,
+    measured_move,
+    measured_sensitivity,
+)
+from fieldtool.design.predict import Prediction
+from fieldtool.design.servo import Servo
+from fieldtool.design.tuning import Tuning
+from fieldtool.design.verdict import Comparison, faults
+from fieldtool.errors import IdentificationError, OutputError
+from fieldtool.experiment.axes import Axes
+from fieldtool.experiment.verification.oscillation import HOLD_LEVEL
+from fieldtool.experiment.verification.trial import Tried, run_trial
+from fieldtool.records.model import FloatArray, MachineModel
+from fieldtool.records.recording import Experiment, RecordingWriter
+from fieldtool.records.yaml_file import write_yaml
+from fieldtool.report.verification_picture import draw_verification
+from fieldtool.workflow.preparation import axes_of, recording_header, setting_of
+from fieldtool.workflow.session import Session
+from fieldtool.workflow.trial_plan import (
+    TrialPlan,
+    plan_trial,
+    torque_steps,
+    wait_for_standstill,
+)
+from fieldtool.writeback.temporary import backed_up
+
+FORMAT = "fieldtool-verification/1"
+LOUDER, LOUDEST = 1.5, 4.0
+"""Times its swing with the old parameters by which a torque may swing at rest; and times the watch's
+usual level, at most."""
+Verdict = Literal["verified", "restored", "not tried"]
+
+
+@dataclass(frozen=True, eq=False)
+class Verified:
+    """What the trial showed."""
+
+    verdict: Verdict
+    reasons: tuple[str, ...]
+    """Why the old parameters were restored; empty where they were not."""
+    axes: tuple[Comparison, ...]
+    parameters: tuple[Change, ...]
+    """What was tried: new parameters, and the old ones that they took the place of."""
+    bound: float
+    model: Literal["identified", "prior"]
+    """What the prediction rests on."""
+    cycle: float
+    """s."""
+    notes: tuple[str, ...] = ()
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values, as ``verification.yaml`` and ``--json`` have them."""
+        return {
+            "format": FORMAT,
+            "verdict": self.verdict,
+            "reasons": list(self.reasons),
+            "bound": self.bound,
+            "model": self.model,
+            "cycle": self.cycle,
+            "axes": [axis.as_dict() for axis in self.axes],
+            "parameters": [
+                {"axis": c.axis, "name": c.name, "before": c.before, "after": c.after}
+                for c in self.parameters
+            ],
+            "notes": list(self.notes),
+        }
+
+
+class Verification:
+    """The trial of one write; its steps are called in order: plan, before, prove.
+
+    Parameters
+    ----------
+    session
+        Its folder gets ``verification.yaml``, ``verification.png`` and the raw data.
+    group
+        Of the machine; all drives disabled.
+    tuning
+        What is to be written.
+    model
+        Of the machine.
+    believed
+        Whether it was identified; else it is the prior model, and what it predicts is not judged by.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        group: CanopenGroup,
+        tuning: Tuning,
+        model: MachineModel,
+        *,
+        believed: bool,
+    ) -> None:
+        self._session, self._group, self._believed = session, group, believed
+        self._stated = (
+            {axis.axis: axis.sensitivity_peak for axis in tuning.axes} if believed else {}
+        )
+        self._bound = tuning.bound
+        self._setting = setting_of(session.machine, group, model)
+        self._axes: Axes = axes_of(group, self._setting)
+        self._plan: TrialPlan | None = None
+        self._changes: tuple[Change, ...] = ()
+        self._old: Tried | None = None
+        self._recorder: RecordingWriter | None = None
+        self.result: Verified | None = None
+
+    def plan(self, changes: Sequence[Change]) -> TrialPlan:
+        """Plan the trial for what a write changes; nothing moves.
+
+        Raises
+        ------
+        PlanRefusedError
+            If the new parameters are not stable by the model, or nothing may move.
+        """
+        self._changes = tuple(changes)
+        wait_for_standstill(self._group)
+        self._plan = plan_trial(self._group, self._setting, changes, self._bound, self._stated)
+        for note in self._plan.notes:
+            self._session.warn(note)
+        return self._plan
+
+    def before(self) -> None:
+        """Try the parameters that are in the drives.
+
+        Raises
+        ------
+        OscillationError
+            If an axis swings or runs away with them; nothing was written.
+        StoppedError
+            If a limit was passed, or the user stopped.
+        """
+        plan = self._planned
+        self._session.screen.stage(
+            "Try the old parameters: hold still, small moves, small excitation"
+        )
+        self._session.screen.say(_what_moves(plan, self._axes))
+        name, path = self._session.machine.name, self._session.folder.parameters_before
+        with backed_up(name, self._group.drives, path), self._recording() as keep:
+            try:
+                self._old = self._run("before", keep, trusts_loops=True)
+            except (OscillationError, IdentificationError) as error:
+                error.add_note(
+                    "That was with the parameters that are in the drives now, in a trial before "
+                    "anything was written; nothing was. Lower the axis' gains by hand (velocity_i, "
+                    "then position_p and velocity_p), and measure and design anew: `fieldtool run`."
+                )
+                raise
+
+    def prove(self) -> None:
+        """Try the parameters that were just written into working memory.
+
+        Raises
+        ------
+        NotVerifiedError
+            If they swing, are worse than the old ones, or not as predicted.
+        UserStopError
+            If the user stopped.
+        """
+        self._session.screen.stage(
+            "Try the new parameters: hold still, small moves, small excitation"
+        )
+        tried: Tried | None = None
+        reasons: tuple[str, ...] = ("the trial was cut short",)
+        try:
+            with self._recording() as keep:
+                tried = self._run("after", keep, trusts_loops=False)
+            reasons = self._judge(tried)
+        except UserStopError:
+            reasons = ("the user stopped the trial",)
+            raise
+        except (StoppedError, IdentificationError) as error:
+            reasons = (str(error),)
+            failed = NotVerifiedError(f"the new parameters do not stand their trial: {error}")
+            for note in getattr(error, "__notes__", ()):
+                failed.add_note(note)
+            raise failed from error
+        finally:
+            self._close()
+            self._conclude(tried, reasons)
+        if reasons:
+            raise NotVerifiedError(
+                f"the new parameters do not stand their trial: {'; '.join(reasons)}"
+            )
+
+    @property
+    def _planned(self) -> TrialPlan:
+        if self._plan is None:
+            raise AssertionError("a trial is planned first")
+        return self._plan
+
+    def _run(self, name: str, keep: Callable[[Experiment], None], *, trusts_loops: bool) -> Tried:
+        louder = self._louder(self._planned.old if name == "before" else self._planned.new)
+        wait_for_standstill(self._group)
+        return run_trial(
+            self._group,
+            self._planned.trial,
+            self._axes,
+            keep,
+            name,
+            trusts_loops=trusts_loops,
+            louder=louder,
+            report=self._session.screen.progress,
+            exciting=self._group.without_feed_forward if self._by_reference else nullcontext,
+        )
+
+    @property
+    def _by_reference(self) -> bool:
+        """Whether position references excite: then feed-forward would take most of the limits."""
+        lines = self._planned.lines
+        return lines is not None and not np.all(lines.by_torque)
+
+    def _louder(self, servos: Sequence[Servo]) -> FloatArray:
+        """Return times the usual level by which torques may swing at rest: what encoders' steps do."""
+        limits = np.array([one.torque for one in self._axes.limits])
+        cycle = self._planned.trial.cycle_time
+        swings = np.array(
+            [
+                torque_steps(drive, servo, cycle)
+                for drive, servo in zip(self._group.drives, servos, strict=True)
+            ]
+        )
+        if self._old is not None:
+            swings = np.maximum(swings, LOUDER * self._old.noise)
+        louder: FloatArray = np.clip(swings / (HOLD_LEVEL * limits), 1.0, LOUDEST)
+        return louder
+
+    @contextmanager
+    def _recording(self) -> Iterator[Callable[[Experiment], None]]:
+        """Give what keeps raw data, in one file for both trials."""
+        if self._recorder is None:
+            header = recording_header(
+                self._session.machine,
+                self._group,
+                self._planned.trial.cycle_time,
+                with_lengths=False,
+            )
+            path = _free(self._session.folder.path / "verification.h5")
+            self._recorder = RecordingWriter(path, header)
+        try:
+            yield self._recorder.append
+        except BaseException:
+            self._close()
+            raise
+
+    def _close(self) -> None:
+        if self._recorder is not None:
+            self._recorder.close()
+            self._recorder = None
+
+    def _judge(self, tried: Tried) -> tuple[str, ...]:
+        plan = self._planned
+        return tuple(
+            text
+            for one in self._compared(tried)
+            for text in faults(one, plan.trial.cycle_time, self._bound, believed=self._believed)
+        )
+
+    def _compared(self, new: Tried | None) -> tuple[Comparison, ...]:
+        plan = self._planned
+        return tuple(self._comparison(plan, k, new) for k in range(len(plan.moves)))
+
+    def _comparison(self, plan: TrialPlan, k: int, new: Tried | None) -> Comparison:
+        move = plan.moves[k]
+        old_curve = self._sensitivity(self._old, k, plan.old[k])
+        new_curve = self._sensitivity(new, k, plan.new[k])
+        frequency = None
+        for curve in (new_curve, old_curve):
+            if curve is not None:
+                frequency = curve.frequency
+        expected = None if frequency is None else self._predicted(plan.new, k, frequency)
+        return Comparison(
+            move.axis,
+            self._axes.unit(k),
+            move.distance,
+            move.duration,
+            move.settling_band,
+            _figures(self._old, k, move.axis, move.settling_band, old_curve),
+            _foreseen(plan.after, k, expected),
+            _figures(new, k, move.axis, move.settling_band, new_curve),
+            old_curve,
+            expected,
+            new_curve,
+        )
+
+    def _sensitivity(self, tried: Tried | None, k: int, servo: Servo) -> Sensitivity | None:
+        lines = self._planned.lines
+        if tried is None or lines is None:
+            return None
+        one = tried.excitation
+        if one is None or not one.complete or one.period is None:
+            return None
+        own = lines.axis == k
+        name = self._axes.names[k]
+        offset = one.extra.get(f"{name}.torque_offset") if np.all(lines.by_torque[own]) else None
+        step = self._planned.trial.cycle_time
+        rows = slice(-(one.samples // lines.samples - 1) * lines.samples, None)
+        return measured_sensitivity(
+            Excited(
+                lines.number[own],
+                lines.samples,
+                step,
+                one.position[rows, k],
+                one.torque[rows, k],
+                None if offset is None else offset[rows],
+            ),
+            servo,
+        )
+
+    def _predicted(self, servos: Sequence[Servo], k: int, frequency: FloatArray) -> Sensitivity:
+        response = respond(machine_of(self._setting.model), 2 * np.pi * frequency)
+        return Sensitivity(
+            frequency, np.abs(Loops(response, tuple(servos)).sensitivity[:, k]).astype(np.float64)
+        )
+
+    def _conclude(self, tried: Tried | None, reasons: tuple[str, ...]) -> None:
+        """Keep what was found; a disk that is full must not hide it."""
+        self.result = Verified(
+            "restored" if reasons else "verified",
+            reasons,
+            self._compared(tried),
+            self._changes,
+            self._bound,
+            "identified" if self._believed else "prior",
+            self._planned.trial.cycle_time,
+            self._planned.notes,
+        )
+        folder = self._session.folder
+        folder.note("verified", verdict=self.result.verdict, reasons=list(reasons))
+        self._session.screen.verified(self.result)
+        histories = [
+            (one, self._history(self._old, k), self._history(tried, k))
+            for k, one in enumerate(self.result.axes)
+        ]
+        try:
+            write_yaml(folder.verification, self.result.as_dict())
+            draw_verification(histories, self._planned.after, folder.verification_picture)
+        except OutputError as error:
+            self._session.warn(str(error))
+
+    def _history(self, tried: Tried | None, k: int) -> tuple[FloatArray, ...] | None:
+        """Return time, reference, position of an axis' own move, from where it began."""
+        one = None if tried is None else tried.move(self._axes.names[k])
+        if one is None or one.position_reference is None:
+            return None
+        reference = one.position_reference[:, k]
+        return one.time, reference - reference[0], one.position[:, k] - reference[0]
+
+
+def _figures(
+    tried: Tried | None, k: int, name: str, band: float, curve: Sensitivity | None
+) -> AxisFigures | None:
+    one = None if tried is None else tried.move(name)
+    if one is None or one.position_reference is None or not one.complete:
+        return None
+    moves = measured_move(one.time, one.position_reference[:, k], one.position[:, k], band)
+    torque = one.torque[:, k]
+    return axis_figures(moves, float(np.abs(torque - torque[0]).max()), curve)
+
+
+def _foreseen(prediction: Prediction, k: int, curve: Sensitivity | None) -> AxisFigures | None:
+    axis = prediction.axes[k]
+    if axis.move is None:
+        return None
+    return axis_figures([axis.move], axis.peak_torque, curve)
+
+
+def _what_moves(plan: TrialPlan, axes: Axes) -> str:
+    ways = ", ".join(
+        f"{move.axis} by {move.distance:.3g} {axes.unit(k)} at up to {move.velocity:.3g} "
+        f"{axes.unit(k)}/s"
+        for k, move in enumerate(plan.moves)
+    )
+    return (
+        f"About {plan.trial.duration:.0f} s: {ways}, each out and back"
+        f"{'; then all a little at the same time' if plan.trial.excitation else ''}."
+    )
+
+
+def _free(path: Path) -> Path:
+    """Return the path, or the next one with a number that is not there yet."""
+    number, candidate = 2, path
+    while candidate.exists():
+        candidate = path.with_name(f"{path.stem}-{number}{path.suffix}")
+        number += 1
+    return candidate

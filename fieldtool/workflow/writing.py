@@ -1,0 +1,101 @@
+"""Bring a tuning into the drives, and try it there: only what has stood its trial may be stored."""
+
+from collections.abc import Callable, Sequence
+
+from drives.canopen_drive import CanopenGroup
+from drives.errors import NotSupportedError, UserStopError
+from drives.parameters import Change
+from fieldtool.design.tuning import Tuning
+from fieldtool.errors import PlanRefusedError
+from fieldtool.records.model import MachineModel
+from fieldtool.workflow.session import Options, Session, parameter_table
+from fieldtool.workflow.verifying import Verification, Verified
+from fieldtool.writeback.transaction import WriteBack, apply, changes_for
+
+Confirm = Callable[[Sequence[Change]], bool]
+
+
+def written(
+    session: Session,
+    group: CanopenGroup,
+    tuning: Tuning,
+    options: Options,
+    confirm: Confirm,
+    model: MachineModel,
+    *,
+    believed: bool,
+    ask_to_move: bool,
+) -> tuple[WriteBack, Verified | None]:
+    """Write a tuning if the options say so, and have the machine judge it.
+
+    Parameters
+    ----------
+    session, group
+        Of the machine; all drives disabled.
+    tuning
+        New parameters.
+    options
+        Whether to write, to try, to store.
+    confirm
+        Sees old and new values and says whether to write.
+    model
+        Of the machine, to plan the trial by and to compare with.
+    believed
+        Whether it was identified.
+    ask_to_move
+        Whether nobody has been asked yet whether the machine may move.
+
+    Raises
+    ------
+    PlanRefusedError
+        If something is to be stored untried, or the new parameters are bad by the model.
+    OscillationError
+        If an axis swings with its old parameters; nothing was written.
+    WriteBackError, WriteBackMixedError
+        As :func:`fieldtool.writeback.transaction.apply`; also if the new parameters fail their trial.
+    """
+    if not options.write:
+        try:
+            changes = changes_for(group.drives, tuning)
+        except NotSupportedError as error:  # a drive whose gains are for its maker's software
+            session.warn(str(error))
+            changes = ()
+        designed = WriteBack((), changes, in_memory=False, stored=False, backup=None)
+        session.folder.note("parameters", rows=parameter_table(designed))
+        return designed, None
+    if options.store and not options.verify:
+        raise PlanRefusedError(
+            "only parameters that were tried on the machine are stored: leave --no-verify or --store "
+            "away. Nothing was written."
+        )
+    verification = None
+    if options.verify:
+        verification = Verification(session, group, tuning, model, believed=believed)
+        verification.plan(changes_for(group.drives, tuning))
+
+    def agreed(changes: Sequence[Change]) -> bool:
+        if not confirm(changes):
+            return False
+        if verification is not None:
+            if ask_to_move and not session.ready():
+                raise UserStopError("not begun: nothing was moved or written")
+            verification.before()
+        session.screen.stage("Write the new parameters, and read them back")
+        return True
+
+    result = apply(
+        session.machine.name,
+        group.drives,
+        tuning,
+        session.folder.parameters_before,
+        agreed,
+        options.store,
+        session.screen.say,
+        verification.prove if verification else None,
+    )
+    session.folder.note("parameters", rows=parameter_table(result))
+    session.folder.note("write", written=result.in_memory, stored=result.stored)
+    session.screen.say(result.sentence)
+    if result.in_memory and verification is None:
+        session.warn("The new parameters were not tried on the machine (--no-verify).")
+    return result, verification.result if verification else None

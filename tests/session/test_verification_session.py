@@ -1,0 +1,278 @@
+"""New parameters through the bus: tried on the machine, kept or taken back, and told."""
+
+import json
+
+import numpy as np
+import pytest
+import yaml
+
+from drives.profile import load_machine
+from drives.sim.faults import EncoderStuck, MotorReversed
+from drives.sim.firmware import Parameter
+from fieldtool.design.loops import Loops
+from fieldtool.design.machine import machine_of, respond
+from fieldtool.design.servo import Timing, servo_from_parameters
+from fieldtool.records.model_file import write_model
+from fieldtool.records.recording import load
+from fieldtool.workflow.models import truth_model
+from tests.session.conftest import GAINS
+from tests.session.test_trial import Gains
+
+TABLE, ARM = 11, 12
+VELOCITY_P, VELOCITY_I, POSITION_P = (0x2010, 2), (0x2010, 3), (0x2010, 1)
+GOOD = {
+    "table": {"velocity_p": 2.0, "velocity_i": 20.0, "position_p": 12.0, "velocity_ff": 1.0},
+    "arm": {"velocity_p": 1.6, "velocity_i": 16.0, "position_p": 12.0, "velocity_ff": 1.0},
+}
+"""Faster than what is in the drives, with good margins."""
+
+
+@pytest.fixture
+def session(bench):
+    """A session folder with a good tuning and the true model."""
+    bench.out.mkdir()
+    (bench.out / "machine.yaml").write_text(bench.profile.read_text())
+    write_tuning(bench, GOOD)
+    write_model(truth_model(load_machine(bench.profile)), bench.out / "model.yaml")
+    return bench
+
+
+def peaks(bench, parameters):
+    """Of sensitivity, with the true model."""
+    machine = machine_of(truth_model(load_machine(bench.profile)))
+    servos = tuple(
+        servo_from_parameters({**GAINS, **own}, Timing(0.22e-3, 0.0)) for own in parameters.values()
+    )
+    response = respond(machine, np.geomspace(1.0, 600.0, 4000))
+    return np.abs(Loops(response, servos).sensitivity).max(axis=0).tolist()
+
+
+def write_tuning(bench, parameters, designed=None):
+    """Write a tuning that says what the designed parameters come to, these or others."""
+    said = peaks(bench, designed or parameters)
+    tuning = {
+        "format": "fieldtool-tuning/1",
+        "axes": [
+            {"axis": axis, "parameters": dict(own), "sensitivity_peak": peak, "reason": "test"}
+            for (axis, own), peak in zip(parameters.items(), said, strict=True)
+        ],
+    }
+    (bench.out / "tuning.yaml").write_text(yaml.safe_dump(tuning))
+
+
+def scaled_model(bench, factor):
+    """Write the true model with all masses, springs and dampers so many times too large."""
+    path = bench.out / "model.yaml"
+    data = yaml.safe_load(path.read_text())
+    for axis in data["axes"]:
+        for name in ("masses", "springs", "dampers"):
+            for one in axis[name]:
+                one["value"] *= factor
+    for coupling in data["couplings"]:
+        coupling["value"] *= factor
+    path.write_text(yaml.safe_dump(data))
+
+
+def write(bench, *options):
+    return bench.command("write", bench.out, "--yes", *options)
+
+
+def verification(bench):
+    return yaml.safe_load((bench.out / "verification.yaml").read_text())
+
+
+class AfterWrite:
+    """Brings a fault about as soon as the drives were written and read back: behind the tool's back."""
+
+    def __init__(self, bench, monkeypatch, fault):
+        from fieldtool.workflow.verifying import Verification
+
+        prove = Verification.prove
+
+        def spoiled(one):
+            bench.inject(fault)
+            try:
+                prove(one)
+            finally:
+                bench.machine.lift(fault)
+
+        monkeypatch.setattr(Verification, "prove", spoiled)
+
+
+def test_good_parameters_are_tried_kept_and_compared_on_one_scale(session):
+    outcome = write(session)
+    assert outcome.code == 0, outcome.err
+    assert "The new parameters stand their trial." in " ".join(
+        outcome.err.split() + outcome.out.split()
+    )
+    assert set(session.changed()[TABLE]) <= {"0x2010:01", "0x2010:02", "0x2010:03", "0x2010:04"}
+    assert session.powered() == {}
+    found = verification(session)
+    assert found["format"] == "fieldtool-verification/1"
+    assert found["verdict"] == "verified"
+    assert found["model"] == "identified"
+    for axis in found["axes"]:
+        before, predicted, after = (axis[k] for k in ("before", "predicted", "after"))
+        assert after["settling_time"] <= 1.05 * before["settling_time"] + 0.003
+        assert after["sensitivity_peak"] == pytest.approx(predicted["sensitivity_peak"], rel=0.05)
+        assert after["settling_time"] == pytest.approx(
+            predicted["settling_time"], rel=0.1, abs=0.005
+        )
+        assert after["overshoot"] == pytest.approx(
+            predicted["overshoot"], rel=0.1, abs=0.02 * axis["move"]["band"]
+        )
+    raw = load(session.out / "verification.h5")
+    assert [e.name.split(": ")[0] for e in raw.experiments] == ["before"] * 3 + ["after"] * 3
+    assert (session.out / "verification.png").stat().st_size > 10_000
+
+
+def test_only_what_was_tried_is_stored(session):
+    outcome = write(session, "--store", "--no-verify")
+    assert outcome.code == 2
+    assert "tried on the machine" in outcome.err
+    assert session.changed() == {}
+    outcome = write(session, "--store")
+    assert outcome.code == 0, outcome.err
+    for node in session.machine.nodes:
+        node.power_cycle()
+    assert "0x2010:02" in session.changed()[TABLE], "it survived the power cycle"
+
+
+def test_untried_parameters_are_said_to_be_so(session):
+    outcome = write(session, "--no-verify")
+    assert outcome.code == 0, outcome.err
+    assert "were not tried" in " ".join((outcome.out + outcome.err).split())
+    assert not (session.out / "verification.yaml").exists()
+
+
+DISASTERS = {
+    "gains 100 times too high in the drive": Gains(TABLE, 100.0),
+    "gains 10 times too high in the drive": Gains(TABLE, 10.0),
+    "gains 10 times too high in the other drive": Gains(ARM, 10.0),
+    "position and integral gain too high": Gains(
+        TABLE, 20.0, (Parameter.POSITION_P, Parameter.VELOCITY_I)
+    ),
+    "wrong sign": MotorReversed(ARM),
+    "encoder does not count": EncoderStuck(TABLE),
+}
+
+
+@pytest.mark.parametrize("what", DISASTERS)
+def test_a_disaster_behind_the_tools_back_is_caught_and_restored(session, monkeypatch, what):
+    AfterWrite(session, monkeypatch, DISASTERS[what])
+    outcome = write(session, "--store")
+    assert outcome.code == 6, outcome.err
+    assert "do not stand their trial" in outcome.err
+    assert "all parameters were restored and read back" in outcome.err
+    assert session.powered() == {}
+    assert session.changed() == {}
+    assert session.stored() == {TABLE: {}, ARM: {}}, "nothing was stored"
+    found = verification(session)
+    assert found["verdict"] == "restored"
+    assert found["reasons"]
+
+
+@pytest.mark.parametrize(
+    ("factor", "names"),
+    [(10.0, ("velocity_p",)), (10.0, ("velocity_p", "velocity_i")), (10.0, ("position_p",))],
+)
+def test_a_tuning_ten_times_too_high_never_stays(session, factor, names):
+    wrong = {axis: dict(own) for axis, own in GOOD.items()}
+    for name in names:
+        wrong["table"][name] *= factor
+    write_tuning(session, wrong, GOOD)
+    outcome = write(session)
+    assert outcome.code in (3, 6), outcome.err
+    assert session.changed() == {}
+    assert session.powered() == {}
+
+
+@pytest.mark.parametrize("factor", [0.5, 2.0])
+def test_a_model_wrong_by_two_is_told_by_the_machine(session, factor):
+    """What it predicts is not what is measured."""
+    scaled_model(session, factor)
+    outcome = write(session)
+    assert outcome.code in (3, 4, 6), outcome.err
+    assert session.changed() == {}
+    if outcome.code == 6:
+        assert "predicted" in outcome.err
+
+
+def test_parameters_that_are_slower_than_the_old_ones_are_taken_back(session):
+    gentle = {"position_p": 3.0, "velocity_p": 1.2, "velocity_i": 1.0, "velocity_ff": 0.0}
+    slow = {axis: {**own, **gentle} for axis, own in GOOD.items()}
+    write_tuning(session, slow)
+    outcome = write(session)
+    assert outcome.code == 6, outcome.err
+    assert "with the old parameters" in outcome.err
+    assert session.changed() == {}
+
+
+def test_an_axis_that_oscillates_already_is_said_and_nothing_is_written(make_bench, profile_of_two):
+    gains = profile_of_two["simulation"]["axes"][0]["gains"]
+    gains["position_p"], gains["velocity_i"] = 300.0, 160.0
+    bench = make_bench(profile_of_two)
+    bench.out.mkdir()
+    (bench.out / "machine.yaml").write_text(bench.profile.read_text())
+    write_tuning(bench, GOOD)
+    outcome = bench.command("write", bench.out, "--yes")
+    assert outcome.code == 4, outcome.err
+    assert "table" in outcome.err
+    assert "in the drives now" in outcome.err
+    assert bench.changed() == {}
+    assert bench.powered() == {}
+
+
+def test_nobody_is_asked_to_move_means_nothing_moves(session):
+    session.listen()
+    outcome = session.command("write", session.out)
+    assert "nobody to ask" in " ".join((outcome.out + outcome.err).split())
+    assert not [f for f in session.heard() if f.cob_id == 0x80], "no SYNC: nothing moved"
+    assert session.changed() == {}
+
+
+def test_a_stop_by_the_user_during_the_trial_restores_everything(session, monkeypatch):
+    from fieldtool.cli import main as cli
+    from fieldtool.workflow.verifying import Verification
+
+    begun = []
+    prove = Verification.prove
+
+    def noted(one):
+        begun.append(True)
+        prove(one)
+
+    monkeypatch.setattr(Verification, "prove", noted)
+    asked = []
+
+    def pressed(key):
+        asked.append(bool(begun))
+        return sum(asked) > 1500
+
+    monkeypatch.setattr(cli.StopKey, "__call__", pressed)
+    outcome = write(session)
+    assert outcome.code == 130, outcome.err
+    assert session.changed() == {}
+    assert session.powered() == {}
+    assert verification(session)["verdict"] == "restored"
+
+
+def test_a_loaded_axis_moves_away_from_the_end_of_its_travel(session):
+    """The move goes where there is room, from where the axis stands."""
+    profile = session.data
+    profile["axes"][0]["limits"]["travel"] = ["-10 deg", "230 deg"]
+    (session.out / "machine.yaml").write_text(yaml.safe_dump(profile))
+    outcome = write(session)
+    assert outcome.code == 0, outcome.err
+    raw = load(session.out / "verification.h5")
+    for experiment in raw.experiments:
+        assert np.min(experiment.position[:, 0]) > np.radians(-10)
+
+
+@pytest.mark.usefixtures("quick_plan")
+def test_a_whole_run_has_the_verification_in_its_json(small_bench):
+    outcome = small_bench.run("--json", "--write", "--yes")
+    assert outcome.code == 0, outcome.err
+    found = json.loads(outcome.out)["verification"]
+    assert found["verdict"] == "verified"
+    assert found["axes"][0]["after"]["sensitivity_peak"] < 2.1
