@@ -191,7 +191,9 @@ class Transaction:
         try:
             self._refuse_or_say(reason, cause)
         except DrivesError as error:
-            for note in getattr(cause, "__notes__", ()):  # such as a drive that may still be enabled
+            for note in getattr(
+                cause, "__notes__", ()
+            ):  # such as a drive that may still be enabled
                 error.add_note(note)
             raise
 
