@@ -8,7 +8,6 @@ error holds whatever the controllers did; what it leaves is compared with the no
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
-from math import sqrt
 
 import numpy as np
 
@@ -36,8 +35,16 @@ from fieldtool.identify.multisine.dry_friction import (
     dry_friction,
     without_dry_friction,
 )
+from fieldtool.identify.multisine.notes import (
+    cross_check,
+    friction_notes,
+    misfit_note,
+    mode_notes,
+    runner_up,
+    structure_notes,
+    transient_note,
+)
 from fieldtool.identify.multisine.records import check_alive, moving_on, settled, with_periods
-from fieldtool.identify.multisine.second_look import still_in_doubt, structure_still_in_doubt
 from fieldtool.identify.multisine.whole_records import WholeRecords
 from fieldtool.records.model import Estimate, Kind, MachineModel
 from fieldtool.records.recording import Experiment, Recording
@@ -50,8 +57,6 @@ DELAY_SHARE = 0.05
 """Of the sample period: a smaller delay between torque and position is one of sampling, no effect."""
 FRICTION_ROUNDS = 3
 """Of estimating dry friction and fitting without it."""
-DISAGREEMENT = 5.0
-"""Standard errors between two ways to one number above which a note is made."""
 WORTH = 25.0
 """By so much chi2 has to fall for each axis' friction at its last mass to be believed."""
 BENT = 0.01
@@ -60,8 +65,6 @@ GOOD = 3.0
 """Misfit over noise at which no further start is tried."""
 MOST_UNEXPLAINED = 0.3
 """Share of the motion that may be left unexplained."""
-UNEXPLAINED = 1.5
-"""Misfit over noise above which a note is made."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,13 +141,13 @@ def identify_joint(
             fitted, WholeRecords.of(recording, lines, friction), priors
         )
         _check_explained(fit.unexplained(fitted), friction)
-    notes += _structure_notes(reduced, fitted, whole)
-    notes += _mode_notes(order, fitted, whole, data.omega.size)
-    notes += _transient_note(measured, data, fitted)
+    notes += structure_notes(reduced, fitted, whole)
+    notes += mode_notes(order, fitted, whole, data.omega.size)
+    notes += transient_note(measured, data, fitted)
     notes += [unknown.reason for unknown in fitted.unknown]
-    notes += _friction_notes(friction, recording)
-    notes += _misfit_note(fitted)
-    notes += _cross_check(modal, fitted.model, kinds)
+    notes += friction_notes(friction, recording)
+    notes += misfit_note(fitted)
+    notes += cross_check(modal, fitted.model, kinds)
     return JointIdentified(
         model=_with_effects(fitted, friction, recording),
         fitted=fitted,
@@ -262,7 +265,7 @@ def _chosen_order(
         return None
     notes += order.other_doubts
     if order.runner_up is not None:
-        notes.append(_runner_up(order, data.names))
+        notes.append(runner_up(order, data.names))
     for axis in prior.axes if prior is not None else ():
         if order.masses[axis.name] != len(axis.masses):
             notes.append(
@@ -270,15 +273,6 @@ def _chosen_order(
                 f"{len(axis.masses)}. Force it with --masses {axis.name}={len(axis.masses)} to compare."
             )
     return order
-
-
-def _runner_up(order: OrderSelection, names: Sequence[str]) -> str:
-    second = order.runner_up
-    if second is None:
-        return ""
-    chosen = ", ".join(f"{name} {order.masses[name]}" for name in names)
-    other = ", ".join(f"{name} {n}" for name, n in zip(names, second.masses, strict=True))
-    return f"Number of masses, chosen on evidence: {chosen}. Runner-up: {other}; {second.why}."
 
 
 def _starts(
@@ -317,17 +311,6 @@ def _first_fit(
     if best is None:
         raise failure or IdentificationError("there is no machine to begin the fit from")
     return best
-
-
-def _structure_notes(
-    reduced: BlockReduced | None, fitted: RefinedModel, whole: RecordData | None
-) -> list[str]:
-    """Say what the modes tell of couplings in unexpected places, where the records do not deny it."""
-    if reduced is None:
-        return []
-    if whole is None:
-        return list(reduced.notes)
-    return list(structure_still_in_doubt(reduced.structure, fitted, whole))
 
 
 class _Fit:
@@ -435,47 +418,10 @@ def _with_free_motion(
     return found, data
 
 
-def _mode_notes(
-    order: OrderSelection | None, fitted: RefinedModel, whole: RecordData | None, lines: int
-) -> list[str]:
-    """Say which modes are in doubt, by the responses and by the whole records."""
-    doubts = () if order is None else order.mode_doubts
-    return [
-        one.sentence for one in doubts if whole is None or still_in_doubt(one, fitted, whole, lines)
-    ]
-
-
-def _transient_note(measured: JointResult, data: ResponseMatrix, fitted: RefinedModel) -> list[str]:
-    """Say how far the model lies outside of the responses' bands, where transients may be why."""
-    if not measured.transient:
-        return []
-    left = data.residuals(machine_response(fitted.model, data.omega, fitted.delay_values))
-    outside = sqrt(float(left @ left) / left.size)
-    if outside <= UNEXPLAINED:
-        return []
-    return [
-        f"Transients of up to {100 * measured.transient:.0f} % of the signals were taken out of the "
-        f"responses, whose bands are too narrow for it: the model differs from them by {outside:.1f} "
-        "times their noise. More time (--time) would lessen them."
-    ]
-
-
 def _still_loads(model: MachineModel) -> MachineModel:
     """Return the model without friction at its last masses: that is fitted only where it shows."""
     axes = tuple(replace(axis, load_friction=Estimate(0.0)) for axis in model.axes)
     return replace(model, axes=axes)
-
-
-def _friction_notes(friction: DryFriction, recording: Recording) -> list[str]:
-    notes = []
-    for k in friction.seen(SEEN):
-        one, unit = friction.torque[k], recording.axes[k].torque_unit
-        notes.append(
-            f"{friction.axes[k]}: dry friction of {one.value:.3g} +- {1.96 * one.std:.1g} {unit} "
-            f"({100 * friction.share[k]:.1f} % of its torque) was taken off before the fit; its error "
-            "is what may be left of it."
-        )
-    return notes
 
 
 def _check_explained(share: float, friction: DryFriction) -> None:
@@ -489,39 +435,6 @@ def _check_explained(share: float, friction: DryFriction) -> None:
             "another number of masses (--masses AXIS=N), or an axis that does not report its own "
             "torque? Look at the responses in frequency-response.h5, or use the classic plan."
         )
-
-
-def _misfit_note(fitted: RefinedModel) -> list[str]:
-    misfit = sqrt(fitted.chi2 / fitted.degrees_of_freedom)
-    if misfit <= UNEXPLAINED:
-        return []
-    return [
-        f"Measurement and model differ by {misfit:.1f} times the noise: something is not explained by "
-        "masses, springs, dampers, couplings and friction. The intervals are widened by that factor."
-    ]
-
-
-def _cross_check(modal: ModalModel, model: MachineModel, kinds: Mapping[str, Kind]) -> list[str]:
-    """Compare with the paper's reduction, one axis at a time (equations 14 to 22)."""
-    lengths = {axis.name: len(axis.masses) for axis in model.axes}
-    try:
-        single = reduce_modes(modal, lengths, kinds).model
-    except (IdentificationError, ValueError) as error:
-        return [f"The reduction of one axis at a time, for comparison, failed: {error}"]
-    notes = []
-    for one, other in zip(single.axes, model.axes, strict=True):
-        for what, first, second in (
-            ("mass", one.masses, other.masses),
-            ("spring", one.springs, other.springs),
-        ):
-            for k, (a, b) in enumerate(zip(first, second, strict=True)):
-                allowed = DISAGREEMENT * np.hypot(a.std, b.std) + 0.02 * b.value
-                if abs(a.value - b.value) > allowed:
-                    notes.append(
-                        f"{one.name} {what} {k + 1}: {b.value:.4g} by the fit, {a.value:.4g} +- "
-                        f"{1.96 * a.std:.2g} by the reduction of one axis at a time; they should agree."
-                    )
-    return notes
 
 
 def _with_effects(
