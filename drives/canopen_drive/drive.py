@@ -74,14 +74,7 @@ class CanopenDrive:
     @property
     def limits(self) -> AxisLimits:
         """What the axis may do."""
-        limits = self._axis.limits
-        return AxisLimits(
-            limits.travel,
-            limits.velocity,
-            limits.acceleration,
-            limits.torque,
-            limits.following_error,
-        )
+        return self._axis.limits.watched
 
     @property
     def position_unit(self) -> str:

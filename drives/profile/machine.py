@@ -1,10 +1,12 @@
 """Machine profiles: bus, axes, limits, and the model as last accepted."""
 
+from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
+from drives.api import AxisLimits
 from drives.profile.bus import BusProfile
 from drives.profile.chain import ChainProfile, CouplingProfile
 from drives.profile.simulation import SimulationProfile
@@ -29,6 +31,11 @@ class Limits(Part):
     acceleration: Positive
     torque: Positive
     following_error: Positive
+
+    @property
+    def watched(self) -> AxisLimits:
+        """As what moves axes takes them."""
+        return AxisLimits(**{one.name: getattr(self, one.name) for one in fields(AxisLimits)})
 
 
 class MotorInertia(Part):

@@ -53,17 +53,7 @@ def next_plan(
     recording = load(folder.recording if folder else source)
     limits = _envelope(recording)
     if folder and folder.machine.is_file():
-        machine = load_machine(folder.machine)
-        limits = tuple(
-            AxisLimits(
-                (axis.limits.travel[0], axis.limits.travel[1]),
-                axis.limits.velocity,
-                axis.limits.acceleration,
-                axis.limits.torque,
-                axis.limits.following_error,
-            )
-            for axis in machine.axes
-        )
+        limits = tuple(axis.limits.watched for axis in load_machine(folder.machine).axes)
     centre = np.array([sum(one.travel) / 2 for one in limits])
     setting = Setting(found.model, _loops(recording, found), limits, centre)
     cycle_time = recording.sample_period
