@@ -37,7 +37,7 @@ from drives.units import AxisScaling
 logging.getLogger("canopen").setLevel(logging.CRITICAL)  # what goes wrong is raised, not logged
 
 CIA402_DEVICE = 402
-STOP_NODE, ENTER_PRE_OPERATIONAL = 0x02, 0x80
+STOP_NODE, ENTER_PRE_OPERATIONAL, RESET_NODE = 0x02, 0x80, 0x81
 QUICK_STOP = 0x0002
 """Controlword."""
 WAKING = 0.1
@@ -328,6 +328,27 @@ class CanopenDrive:
                 self.line.wait(WAKING)
             clock.wait_until(now + WAKING)  # on a bus that fails too: what fails may do so at once
         return True
+
+    def restart(self, patience: float) -> bool:
+        """Restart the node (NMT reset), as a power cycle would; return whether it is back.
+
+        Parameters
+        ----------
+        patience
+            Seconds to wait for its boot-up message, and for its answers, at most.
+        """
+        booted: list[bool] = []
+
+        def heard(_id: int, data: bytearray, _time: float) -> None:
+            booted.extend([True] if bytes(data) == b"\0" else [])
+
+        self.line.subscribe(0x700 + self.node_id, heard)
+        try:
+            self.node.nmt.send_command(RESET_NODE)
+            self.line.wait(patience, lambda: bool(booted))
+        finally:
+            self.line.unsubscribe(0x700 + self.node_id, heard)
+        return bool(booted) and self.wakes(patience)
 
     @property
     def unasked_answers(self) -> int:

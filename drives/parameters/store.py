@@ -1,6 +1,12 @@
 """Store one drive's parameters in its non-volatile memory (0x1010), and know how that ended."""
 
-from drives.errors import DrivesError, NotSupportedError, SdoAbortError, SdoTimeoutError
+from drives.errors import (
+    DrivesError,
+    NodeAbsentError,
+    NotSupportedError,
+    SdoAbortError,
+    SdoTimeoutError,
+)
 from drives.objects import ObjectAddress, ObjectInfo
 from drives.parameters.values import ParameterDrive
 from drives.profile import Store
@@ -8,6 +14,8 @@ from drives.profile import Store
 NOT_BEGUN = (0x0503, 0x0504, 0x0601, 0x0602, 0x0607, 0x0609, 0x0800)
 """Upper halves of the abort codes with which a drive refuses to store.  CiA 301, object 0x1010: a
 drive that refuses answers 0x0800002x, one whose storing failed answers 0x06060000 (hardware)."""
+BOOT_TIME = 5.0
+"""Seconds that a node may take to boot."""
 POLLING = 0.02
 """Seconds between two looks at a status."""
 TIMED_OUT = 0x05040000
@@ -36,6 +44,9 @@ def check_can_store(drive: ParameterDrive) -> None:
 def store(drive: ParameterDrive) -> None:
     """Store all parameters of a drive as they stand in its working memory, and wait for the end.
 
+    A drive that shows only after a restart what it has stored is restarted: what is read from it then
+    is what its non-volatile memory holds.
+
     Raises
     ------
     StoreRefusedError
@@ -57,6 +68,11 @@ def store(drive: ParameterDrive) -> None:
         raise
     if how.status is not None and how.status_done is not None:
         _wait_for_status(drive, how.status, how.status_done, how.timeout)
+    if how.verify == "read-back after restart" and not drive.restart(max(how.timeout, BOOT_TIME)):
+        raise NodeAbsentError(
+            f"{drive.axis}: node {drive.node_id} does not come back after the restart that shows what "
+            "it has stored. Switch it off and on."
+        )
 
 
 def _wait_for_status(

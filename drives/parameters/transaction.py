@@ -165,7 +165,7 @@ class Transaction:
         except StoreRefusedError:
             self.journal = self.journal.refused_to_store(drive.axis)
             raise
-        self._check(drive)  # one that had rebooted has stored something else
+        self._check(drive)  # one that has restarted shows what it has stored
 
     def _begin(self, step: Step) -> None:
         self._go(self.journal.began(step))

@@ -47,6 +47,9 @@ class ParameterDrive(Drive, Protocol):
     def wakes(self, patience: float) -> bool:
         """Whether it answers within so many seconds."""
 
+    def restart(self, patience: float) -> bool:
+        """Restart it as a power cycle would; whether it is back within so many seconds."""
+
     def power_state(self) -> PowerState:
         """Power state that the drive shows."""
 

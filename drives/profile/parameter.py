@@ -2,11 +2,20 @@
 
 from typing import Annotated, Literal
 
-from pydantic import ConfigDict, Field
+from pydantic import ConfigDict, Field, model_validator
 
 from drives.errors import NotSupportedError
 from drives.objects import DataType
-from drives.profile.values import UNKNOWN, Address, Number, Part, Positive, Seconds, Unknown
+from drives.profile.values import (
+    UNKNOWN,
+    Address,
+    LocatedError,
+    Number,
+    Part,
+    Positive,
+    Seconds,
+    Unknown,
+)
 
 GainsVia = Literal["objects", "password", "read-only", "interpreter", "none", "unknown"]
 """How gains are reached: as objects; as objects once a password was written; as objects that can
@@ -142,6 +151,14 @@ class Store(Part):
     """Whether stored values act only after a restart."""
     states: Literal["any", "disabled", "unknown"] = "disabled"
     """Power states in which the drive stores."""
+
+    @model_validator(mode="after")
+    def _status_is_known(self) -> "Store":
+        if self.verify == "status" and (self.status is None or self.status_done is None):
+            raise LocatedError(
+                ("verify",), "status needs `status` and `status_done`: where, and what"
+            )
+        return self
 
     @property
     def signature_value(self) -> int:

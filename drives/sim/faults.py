@@ -146,6 +146,15 @@ class StoreFails(Fault):
 
 
 @dataclass(frozen=True)
+class StoreForgets(Fault):
+    """0x1010 answers as if it had stored, and nothing is stored."""
+
+    def set(self, machine: "RunningMachine", *, present: bool) -> None:
+        """Break or mend the memory."""
+        machine.node(self.node_id).store_forgets = present
+
+
+@dataclass(frozen=True)
 class EncoderStuck(Fault):
     """The encoder stays where it is, for the loops and for the host."""
 

@@ -90,6 +90,7 @@ class DriveNode:
         self.network, self._axes, self._scales = port, axes, scales
         self._scheduler, self._changed = scheduler, on_communication_change
         self.store_fails: int | None = None
+        self.store_forgets = False
         """Fault injection: abort code with which storing ends."""
         self.on_store: Callable[[], None] | None = None
         """Fault injection: called when storing begins."""
@@ -431,7 +432,7 @@ class DriveNode:
         self.sdo.wait_with_answer(self.store_time, finish)
 
     def _save(self) -> int | None:
-        if self.store_fails is None:
+        if self.store_fails is None and not self.store_forgets:
             self.memory.save(self.dictionary)
         return self.store_fails
 

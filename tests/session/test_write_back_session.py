@@ -2,7 +2,9 @@
 
 import json
 import signal
+from contextlib import contextmanager
 from dataclasses import dataclass
+from importlib.resources import files
 
 import can
 import pytest
@@ -17,6 +19,7 @@ from drives.sim.faults import (
     SdoRefused,
     SdoSilent,
     StoreFails,
+    StoreForgets,
     WriteAltered,
 )
 
@@ -193,6 +196,56 @@ def test_a_drive_that_refuses_to_store_takes_the_others_back(session):
     assert session.changed() == {}
     power_cycle(session)
     assert session.changed() == {}
+
+
+@contextmanager
+def heard(session):
+    """What is on the bus meanwhile."""
+    with can.Bus(interface="fieldsim", channel=session.channel) as bus:
+        frames = []
+
+        def so_far():
+            while (message := bus.recv(0)) is not None:
+                frames.append(message)
+            return frames
+
+        yield so_far
+
+
+@pytest.fixture
+def restarting(session):
+    """The same, with drives that show only after a restart what they have stored."""
+    shipped = files("profiles").joinpath("drives")
+    text = shipped.joinpath("reference.yaml").read_text(encoding="utf-8")
+    text = text.replace("verify: answer", "verify: read-back after restart")
+    text = text.replace("eds: reference.eds", f"eds: {shipped.joinpath('reference.eds')}")
+    own = session.out.parent / "restarting.yaml"
+    own.write_text(text, encoding="utf-8")
+    machine = session.out / "machine.yaml"
+    machine.write_text(machine.read_text().replace("drive: reference", f"drive: {own}"))
+    return session
+
+
+def test_a_drive_that_tells_only_after_a_restart_is_restarted_and_read_back(restarting):
+    table, arm = (restarting.machine.node(n) for n in (TABLE, ARM))
+    with heard(restarting) as frames:
+        outcome = write(restarting, "--store")
+        resets = [bytes(m.data) for m in frames() if m.arbitration_id == 0]
+    assert outcome.code == 0, outcome.err
+    assert resets.count(bytes((0x81, TABLE))) == resets.count(bytes((0x81, ARM))) == 1
+    assert held(restarting, TABLE) == held(restarting, ARM) == NEW_RAW
+    for node in (table, arm):
+        assert node.memory.stored[VELOCITY_P] == NEW_RAW[VELOCITY_P]
+
+
+def test_a_drive_that_says_it_has_stored_and_has_not_takes_the_others_back(restarting):
+    restarting.inject(StoreForgets(ARM))
+    outcome = write(restarting, "--store")
+    assert outcome.code in (6, 7), outcome.err
+    assert "arm, velocity_p, object 0x2010:02: wrote 2000, the drive holds 1200" in outcome.err
+    assert restarting.changed() == {}
+    power_cycle(restarting)
+    assert restarting.changed() == {}
 
 
 # --- refused, altered, vanished ------------------------------------------------------------------
