@@ -9,6 +9,8 @@ from scipy.linalg import expm
 
 from drives.sim.firmware import DriveHardware, Parameter, SimulatedAxes
 from drives.sim.plant import ChainParameters, PlantParameters
+from fieldtool.design.decide import design
+from fieldtool.design.drive_side import DriveSide
 from fieldtool.design.loops import Loops, stable, system_matrix
 from fieldtool.design.machine import machine_of, respond
 from fieldtool.design.margins import margins_of
@@ -241,3 +243,53 @@ def test_effects_of_an_extended_model_act() -> None:
         np.array([[s**2 + 7.0, -7.0], [-7.0, 2 * s**2 + hung + 7.0]])
     ) @ np.diag([1.2 / (1 + 0.01 * s), 1.0])
     assert respond(machine, np.array([w])).motors[0] == pytest.approx(by_hand)
+
+
+def test_the_peak_of_sensitivity_is_that_of_the_simulated_firmware(
+    random_model: RandomModel, fresh_rng: np.random.Generator
+) -> None:
+    """A sine of torque is added in the sampled loops at the designed peak; what acts is S times it."""
+    model = random_model(fresh_rng, (2, 1))
+    timing, rate = Timing(0.22e-3, 0.125e-3, 0.004), 8000.0
+    sides = [DriveSide(a.name, None, timing, 500.0 * a.total_mass, 1e-6) for a in model.axes]
+    tuning = design(model, sides, response="stiff")
+    assert tuning.prediction is not None
+    chains = tuple(
+        ChainParameters(
+            *(tuple(e.value for e in part) for part in (a.masses, a.springs, a.dampers))
+        )
+        for a in model.axes
+    )
+    names = model.names
+    couplings = tuple(
+        (names.index(c.axes[0]), names.index(c.axes[1]), c.value) for c in model.couplings
+    )
+    hardware = DriveHardware(1000.0, 0.0, 2**30 / (2 * np.pi))
+    k = int(fresh_rng.integers(2))
+    margins = tuning.prediction.axes[k].margins
+    axes = SimulatedAxes(PlantParameters(chains, couplings), [hardware] * 2, 1, rate)
+    for i, one in enumerate(tuning.axes):
+        for name, value in one.parameters.items():
+            axes.set(i, Parameter[name.upper()], value)
+        axes.follow_position(i, 0.0, 32)
+    w = 2 * np.pi * margins.peak_frequency
+    size = 0.2 * model.axes[k].total_mass
+    count = int(rate * max(8.0, 40 * 2 * np.pi / w))
+    torque = np.empty(count)
+    for n in range(count):
+        axes.set(k, Parameter.TORQUE_OFFSET, size * np.sin(w * n / rate))
+        for i in range(2):
+            if n % 32 == 0:
+                axes.follow_position(i, 0.0, 32)
+        axes.advance(1)
+        torque[n] = axes.torque(k)
+    last = np.arange(count)[int(0.6 * count) :]
+    basis = np.column_stack([np.sin(w * last / rate), np.cos(w * last / rate)])
+    gain = np.hypot(*np.linalg.lstsq(basis, torque[last], rcond=None)[0]) / size
+    shape = np.prod(
+        [
+            abs(f.response(np.array([1j * w]))[0])
+            for f in sides[k].servo(tuning.axes[k].parameters).loop.filters
+        ]
+    )
+    assert gain / shape == pytest.approx(margins.sensitivity_peak, rel=0.05)
