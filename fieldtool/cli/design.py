@@ -18,6 +18,13 @@ from fieldtool.design.tuning import BOUND, RESPONSES, Tuning
 from fieldtool.design.tuning_file import tuning_as_dict
 
 Figure = Callable[[AxisPrediction], float | None]
+ResponseChoice = Annotated[
+    str,
+    typer.Option(
+        "--response",
+        help=f"How near to the bound the new parameters go: {', '.join(RESPONSES)}.",
+    ),
+]
 
 
 def _motor(name: str) -> Figure:
@@ -48,9 +55,7 @@ ROWS: tuple[tuple[str, float, Figure], ...] = (
 
 def design(
     folder: Annotated[Path, typer.Argument(help="Session folder.")],
-    response: Annotated[
-        str, typer.Option("--response", help=f"{', '.join(RESPONSES)}: how near to the bound.")
-    ] = "normal",
+    response: ResponseChoice = "normal",
     bound: Annotated[
         float, typer.Option("--bound", help="Peak of sensitivity that no axis may exceed.")
     ] = BOUND,
@@ -61,8 +66,7 @@ def design(
     as_json: Json = False,
 ) -> None:
     """Design controller parameters from the session folder's model, and predict what they do."""
-    if response not in RESPONSES:
-        raise typer.BadParameter(f"--response is one of {', '.join(RESPONSES)}, got {response!r}")
+    check_response(response)
     if not (isfinite(bound) and bound > 1.1):
         raise typer.BadParameter(f"--bound is a number above 1.1, got {bound:g}")
     console = console_of(as_json)
@@ -76,6 +80,12 @@ def design(
     console.print(Text(f"Kept in {folder}; `fieldtool write {folder}` brings it into the drives."))
     if as_json:
         print_json(tuning_as_dict(tuning))
+
+
+def check_response(response: str) -> None:
+    """Refuse a response that there is none of."""
+    if response not in RESPONSES:
+        raise typer.BadParameter(f"--response is one of {', '.join(RESPONSES)}, got {response!r}")
 
 
 def show_tuning(console: Console, tuning: Tuning) -> None:

@@ -35,7 +35,7 @@ from fieldtool import workflow
 from fieldtool.cli.bus_options import Bitrate, Channel, Interface, on_bus
 from fieldtool.cli.check import check
 from fieldtool.cli.criticise import criticise
-from fieldtool.cli.design import design
+from fieldtool.cli.design import ResponseChoice, check_response, design
 from fieldtool.cli.distinguish import ToDistinguish, tell_apart
 from fieldtool.cli.output import Json, console_of, print_json
 from fieldtool.cli.profile import profile_app
@@ -159,7 +159,9 @@ def _options(
     seconds: float | None = None,
     trace: Path | None = None,
     verify: bool = True,
+    response: str = "normal",
 ) -> workflow.Options:
+    check_response(response)
     if plan not in ("classic", "fast"):
         raise typer.BadParameter(f"no plan is called {plan!r}; there are: fast, classic")
     if plan == "classic" and seconds is not None:
@@ -173,6 +175,7 @@ def _options(
         excitation_time=seconds,
         write=write,
         store=store,
+        response=response,
         motor_inertia="measured" if motor == "measured" else "data sheet",
         trace=trace,
         verify=_tried(verify, store),
@@ -217,6 +220,7 @@ def run(
     verify: Verify = True,
     motor_inertia: Motor = "measured",
     seconds: Seconds = None,
+    response: ResponseChoice = "normal",
     plan_only: PlanOnly = False,
     interface: Interface = None,
     channel: Channel = None,
@@ -229,7 +233,9 @@ def run(
     """MOVES THE MACHINE. Measure, identify, design and, with --write, write back."""
     folder = _folder(out, machine)
     traced = trace_path(trace, trace_file, folder)
-    options = _options(plan, write, store, motor_inertia, seconds, traced, verify)
+    options = _options(
+        plan, write, store, motor_inertia, seconds, traced, verify, response=response
+    )
     console = console_of(as_json)
     if plan_only:
         profile = on_bus(machine, interface, channel, bitrate)
@@ -260,6 +266,7 @@ def demo(
         str, typer.Option("--machine", help="Another packaged simulated machine.")
     ] = "paper-3x3",
     seconds: Seconds = None,
+    response: ResponseChoice = "normal",
     trace: TraceWanted = False,
     trace_file: TraceFile = None,
     out: Out = None,
@@ -274,6 +281,7 @@ def demo(
         store=store,
         motor_inertia="measured",
         seconds=seconds,
+        response=response,
         trace=trace,
         trace_file=trace_file,
         out=out,

@@ -109,6 +109,8 @@ class Options:
     store: bool = False
     verify: bool = True
     """Try old and new parameters on the machine when they are written; without, nothing is stored."""
+    response: str = "normal"
+    """Of the design: a name of :data:`fieldtool.design.tuning.RESPONSES`."""
     motor_inertia: Literal["measured", "data sheet"] = "measured"
     trace: Path | None = None
     """File that every frame of the session is noted in; none where it is None."""

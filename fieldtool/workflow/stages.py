@@ -105,7 +105,7 @@ def run(
             session.screen.found(identified.model, truth_model(session.machine))
             model, criticism = criticised(session, identified.model, stop_requested)
             session.screen.stage("Design new controller parameters")
-            tuning = _design(session.folder, session.machine, model)
+            tuning = _design(session.folder, session.machine, model, options.response)
             session.screen.designed(tuning)
             if stop_requested():
                 raise UserStopError(
@@ -408,6 +408,8 @@ def _band(identified: Identified) -> ModelBand | None:
     return ModelBand(grid, relative_std(identified.fitted, 2 * np.pi * grid))
 
 
-def _design(folder: SessionFolder, machine: MachineProfile, model: MachineModel) -> Tuning:
+def _design(
+    folder: SessionFolder, machine: MachineProfile, model: MachineModel, response: str
+) -> Tuning:
     check_known(model)
-    return designed(folder, machine, model)
+    return designed(folder, machine, model, response)
