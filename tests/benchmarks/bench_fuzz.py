@@ -3,8 +3,11 @@
 A million frames that are nobody's during whole measurements, then look-alikes of the nodes' own frames
 and wrong SDO answers, in measurements and writes.  What must not be: an unhandled exception, a hang, a
 drive under power at the end, a value in a drive that the tool should not have written.
+
+Run by itself: python tests/benchmarks/bench_fuzz.py [--frames N] [--cases N]
 """
 
+import argparse
 import sys
 import time
 from pathlib import Path
@@ -22,12 +25,16 @@ RATES = {"look-alikes": (0.002, 0.01, 0.1, 1.0), "answers": (0.002, 0.01, 0.05, 
 
 
 def main() -> int:
+    options = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    options.add_argument("--frames", type=int, default=FRAMES)
+    options.add_argument("--cases", type=int, default=CASES)
+    asked = options.parse_args()
     seed = int(np.random.SeedSequence().generate_state(1)[0])
     print("seed", seed)
     random, wrong = Random(seed), 0
     began, sent, outcomes = time.process_time(), 0, list[Outcome]()
-    while sent < FRAMES:
-        noise = Noise("bystanders", RATE, random.getrandbits(32), at_most=FRAMES - sent)
+    while sent < asked.frames:
+        noise = Noise("bystanders", RATE, random.getrandbits(32), at_most=asked.frames - sent)
         outcomes.append(disturbed(noise))
         sent += outcomes[-1].frames
         wrong += _told(noise, outcomes[-1]) or outcomes[-1].code != 0
@@ -36,7 +43,7 @@ def main() -> int:
     )
     for kind, rates in RATES.items():
         began, outcomes = time.process_time(), []
-        for _ in range(CASES):
+        for _ in range(asked.cases):
             quiet = random.choice((0, 60, 100, 200, 300, 400))
             noise = Noise(kind, random.choice(rates), random.getrandbits(32), quiet)
             outcomes.append(disturbed(noise, random.choice((Moment.SWEEP, Moment.WRITE))))
@@ -44,7 +51,7 @@ def main() -> int:
         frames = sum(one.frames for one in outcomes)
         seconds = time.process_time() - began
         print(
-            f"{kind}: {CASES} commands, {frames} frames, {tally(outcomes)}, {seconds:.0f} s of CPU"
+            f"{kind}: {asked.cases} commands, {frames} frames, {tally(outcomes)}, {seconds:.0f} s of CPU"
         )
     print(f"{wrong} not as they have to be")
     return min(wrong, 1)
