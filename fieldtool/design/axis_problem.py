@@ -53,6 +53,11 @@ FAR_GAIN = 0.5
 be three times what the model says without making the loop unstable."""
 
 
+FED_NOISE = 2.0
+"""RMS of the torque that rounded targets make by inertia feed-forward, over that allowed of the
+encoder's steps."""
+
+
 @dataclass(frozen=True)
 class Bounds:
     """What one axis' parameters have to keep."""
@@ -262,12 +267,20 @@ class AxisProblem:
         columns = np.column_stack(
             [np.concatenate([one[k] * self._weight for one in signals]) for k in (1, 2)]
         )
-        best = _least_squares(columns, base, known, np.array(self.free))
+        best = _least_squares(columns, base, known, np.array(self.free), self._most_fed(servo))
         errors = tuple(
             one[0] - self._wanted + best[0] * one[1] + best[1] * one[2] for one in signals
         )
         phasors = parts[0] + best[0] * parts[1] + best[1] * parts[2]
         return (float(best[0]), float(best[1]) * self.mass), (errors[0], errors[1]), phasors
+
+    def _most_fed(self, servo: Servo) -> FloatArray:
+        """Return the largest shares of velocity and inertia: targets are rounded to encoder steps."""
+        alone = replace(servo.loop, velocity_ff=0.0, inertia_ff=self.mass)
+        noise = replace(servo, loop=alone).target_noise(self.bounds.resolution)
+        if not (isfinite(noise) and isfinite(self.bounds.noise) and noise > 0):
+            return MOST_FED
+        return np.asarray(np.minimum(MOST_FED, [1.0, FED_NOISE * self.bounds.noise / noise]))
 
     @property
     def _plants(self) -> tuple[ComplexArray, ComplexArray]:
@@ -295,21 +308,25 @@ class AxisProblem:
 
 
 def _least_squares(
-    columns: FloatArray, base: FloatArray, known: FloatArray, free: NDArray[np.bool_]
+    columns: FloatArray,
+    base: FloatArray,
+    known: FloatArray,
+    free: NDArray[np.bool_],
+    most: FloatArray,
 ) -> FloatArray:
     """Return shares within their bounds that make base + columns shares smallest; fixed ones stay."""
-    best = np.clip(known, 0.0, MOST_FED)
+    best = np.where(free, np.clip(known, 0.0, most), known)
     for k in (0, 1, 0, 1) if free.all() else (0, 1):
         if free[k]:
             column = columns[:, k]
             rest = base + columns @ best - column * best[k]
             size = float(column @ column)
-            best[k] = float(np.clip(-(column @ rest) / max(size, 1e-300), 0.0, MOST_FED[k]))
+            best[k] = float(np.clip(-(column @ rest) / max(size, 1e-300), 0.0, most[k]))
     if free.all():
         normal = columns.T @ columns
         normal += 1e-12 * np.trace(normal) * np.eye(2)
         pair = np.linalg.solve(normal, -(columns.T @ base))
-        if np.all((pair >= 0) & (pair <= MOST_FED)):
+        if np.all((pair >= 0) & (pair <= most)):
             return np.asarray(pair)
     return best
 

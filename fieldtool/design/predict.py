@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from math import inf, isfinite, nan
+from math import hypot, inf, isfinite, nan
 from typing import Any
 
 import numpy as np
@@ -76,7 +76,8 @@ class AxisPrediction:
     compliance: float
     """Largest motor position per torque at the motor over all frequencies, rad/(N m) or m/N."""
     noise: float
-    """RMS of the torque that the encoder's steps make; NaN where the encoder is not known."""
+    """RMS of the torque that the steps of encoder and moving targets make; NaN where they are not
+    known."""
     peak_torque: float
     """Largest torque of the move, N m or N; NaN where the machine is not stable."""
     spread: Mapping[str, tuple[float, float]] = field(default_factory=dict)
@@ -177,7 +178,7 @@ def predict(
                 moved.load if moved else None,
                 moved.step if moved else None,
                 float(np.abs(loops.compliance[:, k, k]).max()),
-                servo.torque_noise(steps[k]) if isfinite(steps[k]) else nan,
+                _noise(servo, steps[k]),
                 moved.peak_torque if moved else nan,
                 spreads[k],
                 moved.curves if moved else None,
@@ -185,6 +186,10 @@ def predict(
         )
     peak = sensitivity_peak(loops.input_sensitivity) if steady else inf
     return Prediction(tuple(axes), steady, peak)
+
+
+def _noise(servo: Servo, step: float) -> float:
+    return hypot(servo.torque_noise(step), servo.target_noise(step)) if isfinite(step) else nan
 
 
 def frequencies(machine: Machine, eigenvalues: ComplexArray) -> FloatArray:

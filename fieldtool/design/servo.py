@@ -89,6 +89,26 @@ class Servo:
         x = self.timing.cycle * s
         return np.where(np.abs(x) < 1e-6, 1.0, -np.expm1(-x) / np.where(x == 0, 1.0, x))
 
+    def target_noise(self, resolution: float) -> float:
+        """Return the RMS of the torque that the steps of cyclic targets make while they move, N m or N.
+
+        Targets are rounded to whole steps, as white noise of a step / sqrt(12) at the cycle's rate;
+        their first differences are fed forward as velocity, their second ones as acceleration, both
+        held from target to target.  Torque filters are not reckoned with.  0 where the cycle is not
+        known.
+
+        Parameters
+        ----------
+        resolution
+            One step of the targets, rad or m.
+        """
+        cycle, loop = self.timing.cycle, self.loop
+        if cycle <= 0:
+            return 0.0
+        velocity = np.sqrt(2.0) / cycle * loop.velocity_ff * loop.velocity_p
+        acceleration = np.sqrt(6.0) / cycle**2 * loop.inertia_ff
+        return float(resolution / np.sqrt(12) * np.hypot(velocity, acceleration))
+
     def torque_noise(self, resolution: float) -> float:
         """Return the RMS of the torque reference that an encoder's steps make at standstill, N m or N.
 

@@ -193,6 +193,28 @@ def test_noise_of_an_encoder_as_the_firmware_makes_it() -> None:
     assert servo.torque_noise(step) == pytest.approx(torque[100:].std(), rel=0.03)
 
 
+def test_noise_of_rounded_targets_as_the_firmware_makes_it() -> None:
+    """A slow target in whole counts: its differences, fed forward, are the motor's torque."""
+    step, cycle = 1e-4, 0.002
+    servo = Servo(AxisLoop(0.0, 2.0, 0.0, 1.0, 0.5), timing=Timing(0.0, 0.125e-3, cycle))
+    axes = SimulatedAxes(
+        PlantParameters((ChainParameters((1e9,), (), ()),)),
+        [DriveHardware(1e6, 0.0, 1e9, 1e9)],
+        1,
+    )
+    for name, value in (("VELOCITY_P", 2.0), ("VELOCITY_FF", 1.0), ("INERTIA_FF", 0.5)):
+        axes.set(0, Parameter[name], value)
+    torque = []
+    for n in range(3000):
+        # a parabola: its whole counts are rounded as if by chance
+        axes.follow_position(0, step * round(0.3 * n + 3.7e-4 * n * n), 16)
+        for _ in range(16):
+            axes.advance(1)
+            torque.append(axes.torque(0))
+    found = np.std(torque[100:])
+    assert found == pytest.approx(servo.target_noise(step), rel=0.1)
+
+
 def test_an_unstable_machine_has_no_moves() -> None:
     model = MachineModel(
         (
