@@ -47,7 +47,7 @@ ROUNDED_TARGETS = 4.0
 peak to peak, and the inertia that is fed forward makes torque of it."""
 NOT_AS_SAID = 1.25
 """Factor by which a peak of sensitivity may be off what the tuning says."""
-STANDSTILL_TIME, STANDSTILL_TIMEOUT = 0.25, 30.0
+STANDSTILL_TIME, STANDSTILL_TIMEOUT = 0.25, 120.0
 STANDSTILL_COUNTS, STANDSTILL_TRAVEL = 3.0, 2e-5
 """A disabled axis stands that moves by less than so many counts, or this share of its travel, in so many
 seconds, twice; waited for at most."""
