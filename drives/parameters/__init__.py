@@ -7,7 +7,14 @@ all drives get their old values back, now or by whoever reads the journal next.
 
 from drives.parameters.backup import Backup, DriveBackup, back_up, load_backup, save_backup
 from drives.parameters.bring_back import Found
-from drives.parameters.changes import Change, Written, planned_changes, read_loop, read_parameters
+from drives.parameters.changes import (
+    Change,
+    Written,
+    changes_back_to,
+    planned_changes,
+    read_loop,
+    read_parameters,
+)
 from drives.parameters.guard import check_disabled, check_objects, check_same_drives
 from drives.parameters.journal import (
     Action,
@@ -45,6 +52,7 @@ __all__ = [
     "Transaction",
     "Written",
     "back_up",
+    "changes_back_to",
     "check_can_store",
     "check_disabled",
     "check_objects",

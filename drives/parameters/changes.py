@@ -7,7 +7,7 @@ from math import isfinite
 from drives.canopen_drive import CanopenDrive
 from drives.canopen_drive.conversion import Conversion
 from drives.errors import NotSupportedError
-from drives.objects import COMMANDS, ObjectInfo
+from drives.objects import COMMANDS, ObjectAddress, ObjectInfo
 from drives.parameters.guard import parameter_types
 from drives.parameters.values import Raw, same
 from drives.profile import UNKNOWN, ParameterInfo
@@ -127,6 +127,40 @@ def planned_changes(drive: CanopenDrive, wanted: Mapping[str, float]) -> tuple[C
         change = _change(drive, conversion, name, float(held[name]), new, before, old[name])
         new[name] = change.after
         changes.append(change)
+    return tuple(changes)
+
+
+def changes_back_to(drive: CanopenDrive, held: Mapping[ObjectAddress, Raw]) -> tuple[Change, ...]:
+    """Return what bringing the drive's parameters to values that it held before would change.
+
+    Parameters
+    ----------
+    drive
+        Identified.
+    held
+        What objects held, in the drive's own units; only the parameters of its profile count.
+    """
+    conversion = drive.conversion()
+    changes = []
+    old: dict[str, float] = {}
+    new: dict[str, float] = {}
+    for name, parameter in drive.profile.parameters.items():
+        before = _number(drive, parameter)
+        after = held.get(parameter.object, before)
+        if isinstance(after, str):
+            raise NotSupportedError(
+                f"{drive.axis}, object {parameter.object}: {after!r} is no number"
+            )
+        known = conversion.understood(name)
+        if known:
+            old[name] = conversion.physical(name, before, old)
+            new[name] = conversion.physical(name, after, new)
+        if parameter.object in held:
+            unit = unit_on(drive.axis_profile.kind, parameter.unit) if known else "drive units"
+            values = (old[name], new[name]) if known else (float(before), float(after))
+            changes.append(
+                Change(drive.axis, name, unit, _info(parameter, name), *values, before, after)
+            )
     return tuple(changes)
 
 

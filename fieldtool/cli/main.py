@@ -52,6 +52,7 @@ from fieldtool.cli.screen import (
 )
 from fieldtool.cli.simulate import simulate
 from fieldtool.cli.stop_key import StopKey, may_move, somebody_there, stop_key
+from fieldtool.cli.tools import tools_app
 from fieldtool.cli.tracing import TraceFile, TraceWanted, trace_path
 from fieldtool.errors import (
     FieldtoolError,
@@ -524,6 +525,7 @@ def export(
 
 app.command()(scan)
 app.add_typer(profile_app, name="profile")
+app.add_typer(tools_app, name="tools")
 app.command()(check)
 app.command("replay")(replay_command)
 app.command()(criticise)

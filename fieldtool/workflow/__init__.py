@@ -21,6 +21,7 @@ from fieldtool.workflow.session import (
     parameter_table,
 )
 from fieldtool.workflow.stages import draw, identify, measure, restore, run, write
+from fieldtool.workflow.tools import compare_tools, keep_tool, switch_tool, tools_of
 from fieldtool.workflow.twin import Twin, twin
 
 __all__ = [
@@ -33,12 +34,14 @@ __all__ = [
     "Twin",
     "check",
     "compare",
+    "compare_tools",
     "criticise",
     "distinguish",
     "draw",
     "export_folder",
     "identify",
     "import_folder",
+    "keep_tool",
     "measure",
     "next_plan",
     "parameter_table",
@@ -49,6 +52,8 @@ __all__ = [
     "restore",
     "run",
     "simulate",
+    "switch_tool",
+    "tools_of",
     "truth_model",
     "twin",
     "write",

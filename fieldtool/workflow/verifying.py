@@ -82,7 +82,14 @@ class Verified:
             "cycle": self.cycle,
             "axes": [axis.as_dict() for axis in self.axes],
             "parameters": [
-                {"axis": c.axis, "name": c.name, "before": c.before, "after": c.after}
+                {
+                    "axis": c.axis,
+                    "name": c.name,
+                    "object": str(c.info.address),
+                    "before": c.before,
+                    "after": c.after,
+                    "raw": c.after_raw,
+                }
                 for c in self.parameters
             ],
             "notes": list(self.notes),

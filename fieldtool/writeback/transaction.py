@@ -129,6 +129,21 @@ def apply(
     """
     refuse_unfinished(machine, drives, backup_path.parent)
     changes = changes_for(drives, tuning)
+    return apply_changes(machine, drives, changes, backup_path, confirm, keep, say, prove)
+
+
+def apply_changes(
+    machine: str,
+    drives: Sequence[CanopenDrive],
+    changes: tuple[Change, ...],
+    backup_path: Path,
+    confirm: Confirm,
+    keep: bool = False,
+    say: Callable[[str], None] = lambda _: None,
+    prove: Callable[[], None] | None = None,
+) -> WriteBack:
+    """Do the same as :func:`apply` with changes that are known already, in the order of writing."""
+    refuse_unfinished(machine, drives, backup_path.parent)
     if keep:
         for drive in drives:
             check_can_store(drive)

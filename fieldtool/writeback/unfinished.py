@@ -120,11 +120,14 @@ def not_kept(keeper: JournalKeeper, error: OSError) -> OutputError:
     )
 
 
-def state_folder() -> Path:
-    """Return the folder for notes about unfinished writes: one for each user of a computer."""
+def state_folder(what: str = "unfinished") -> Path:
+    """Return a folder of the tool's own, one for each user of a computer.
+
+    ``unfinished``: notes about unfinished writes; ``tools``: parameter sets of tool set-ups.
+    """
     own = os.environ.get(STATE_VARIABLE)
     if own:
-        return Path(own)
+        return Path(own) if what == "unfinished" else Path(own) / what
     home = Path.home()
     if sys.platform == "win32":
         base = Path(os.environ.get("LOCALAPPDATA") or home / "AppData" / "Local")
@@ -132,7 +135,7 @@ def state_folder() -> Path:
         base = home / "Library" / "Application Support"
     else:
         base = Path(os.environ.get("XDG_STATE_HOME") or home / ".local" / "state")
-    return base / "fieldtool" / "unfinished"
+    return base / "fieldtool" / what
 
 
 def refuse_unfinished(machine: str, drives: Sequence[ParameterDrive], session: Path) -> None:

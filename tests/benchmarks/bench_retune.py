@@ -8,7 +8,8 @@ thumb (``fieldtool.design.rule``) for the old tooling.
 What is wanted: stable in all; measured peak of sensitivity at most 2.1; settling shorter than before in
 at least 90 % of the axes, never more than 5 % longer where the tool kept the parameters; prediction
 against measurement within 10 % (peak) and 15 % (settling, to 3 cycles).  The true model's own figures
-for what was written stand beside.  Left out: criticism and report, which take their time and change nothing here.
+for what was written stand beside.  Left out: criticism and report, which take their time and change
+nothing here.
 
 Rows are appended to a file (``--out``), so that pieces add up: the same seed goes on where it ended.
 """

@@ -1,0 +1,190 @@
+"""``fieldtool tools``: parameter sets of several tool set-ups of one machine."""
+
+from collections.abc import Callable, Sequence
+from datetime import datetime
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from drives.parameters import Change
+from fieldtool import workflow
+from fieldtool.cli.bus_options import Bitrate, Channel, Interface, on_bus
+from fieldtool.cli.output import Json, console_of, print_json
+from fieldtool.cli.screen import TerminalScreen, parameter_table_of, show_parameters
+from fieldtool.cli.stop_key import StopKey, somebody_there, stop_key
+from fieldtool.workflow.tools import Difference
+from fieldtool.writeback.tool_sets import ToolSet
+from fieldtool.writeback.transaction import WriteBack
+
+tools_app = typer.Typer(
+    no_args_is_help=True,
+    help="Parameter sets of several tool set-ups of one machine: keep, compare, switch.",
+)
+Machine = Annotated[str, typer.Argument(help="Name of a machine profile, or path of its file.")]
+Name = Annotated[str, typer.Argument(help="Name of the tool set.")]
+
+
+@tools_app.command("list")
+def list_tools(machine: Machine, as_json: Json = False) -> None:
+    """List the tool sets of a machine."""
+    found = workflow.tools_of(machine)
+    console = console_of(as_json)
+    if as_json:
+        print_json({"tools": [tool.as_dict() for tool in found]})
+        return
+    if not found:
+        console.print("No tool set is kept yet: fieldtool tools keep MACHINE NAME --from SESSION")
+        return
+    console.print(_tools_table(found))
+
+
+@tools_app.command()
+def keep(
+    machine: Machine,
+    name: Name,
+    session: Annotated[
+        Path | None,
+        typer.Option("--from", help="Session folder that wrote them; the drives' own otherwise."),
+    ] = None,
+    interface: Interface = None,
+    channel: Channel = None,
+    bitrate: Bitrate = None,
+    as_json: Json = False,
+) -> None:
+    """Keep what a session wrote, or what the drives hold now, as a tool set."""
+    tool = workflow.keep_tool(on_bus(machine, interface, channel, bitrate), name, session)
+    console = console_of(as_json)
+    count = sum(len(part.held) for part in tool.parameters.drives)
+    tried = "stood their trial on the machine" if tool.verified else "were NOT tried on the machine"
+    console.print(Text(f"{name}: {count} parameters kept in {tool.path}; they {tried}."))
+    if as_json:
+        print_json(tool.as_dict())
+
+
+@tools_app.command()
+def compare(machine: Machine, one: Name, other: Name, as_json: Json = False) -> None:
+    """Show in what two tool sets differ."""
+    a, b, differences = workflow.compare_tools(machine, one, other)
+    console = console_of(as_json)
+    console.print(_tools_table((a, b)))
+    console.print(_difference_table(a, b, differences))
+    if not differences:
+        console.print("  They hold the same parameters.")
+    if as_json:
+        print_json(
+            {
+                "tools": [a.as_dict(), b.as_dict()],
+                "differences": [
+                    {
+                        "axis": d.axis,
+                        "name": d.name,
+                        "object": str(d.address),
+                        one: d.one,
+                        other: d.other,
+                    }
+                    for d in differences
+                ],
+            }
+        )
+
+
+@tools_app.command()
+def switch(
+    machine: Machine,
+    name: Name,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask before writing.")] = False,
+    store: Annotated[
+        bool,
+        typer.Option("--store", help="Keep them in non-volatile memory too, if they were tried."),
+    ] = False,
+    same_drives: Annotated[
+        bool,
+        typer.Option(
+            "--same-drives",
+            help="You know that drives without a serial number are those of the tool set.",
+        ),
+    ] = False,
+    interface: Interface = None,
+    channel: Channel = None,
+    bitrate: Bitrate = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", help="Folder for backup and journal; a new one otherwise."),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Write a tool set into the drives: backup, write, read back; nothing moves."""
+    console = console_of(as_json)
+    folder = out or Path("sessions") / f"{Path(machine).stem}-{name}-{datetime.now():%Y%m%d-%H%M%S}"
+    with stop_key() as key, TerminalScreen(console) as screen:
+        result = workflow.switch_tool(
+            on_bus(machine, interface, channel, bitrate),
+            name,
+            folder,
+            _asker(console, key, yes=yes),
+            store=store,
+            same_drives=same_drives,
+            screen=screen,
+            stop_requested=key,
+        )
+    show_parameters(console, result)
+    console.print(Text(f"  `fieldtool restore {folder}` takes it back."))
+    if as_json:
+        print_json(
+            {
+                "folder": str(folder),
+                "written": result.in_memory,
+                "stored": result.stored,
+                "parameters": workflow.parameter_table(result),
+            }
+        )
+
+
+def _asker(console: Console, key: StopKey, *, yes: bool) -> Callable[[Sequence[Change]], bool]:
+    """Return what shows old and new values, and asks."""
+
+    def ask(changes: Sequence[Change]) -> bool:
+        key.check()
+        if yes:
+            return True
+        planned = WriteBack((), tuple(changes), in_memory=False, stored=False, backup=None)
+        console.print(parameter_table_of(planned, console.width))
+        if not somebody_there():
+            console.print("  Not written: nobody to ask. Use --yes to write without asking.")
+            return False
+        return typer.confirm("Write these parameters into the drives?", err=True)
+
+    return ask
+
+
+def _tools_table(tools: Sequence[ToolSet]) -> Table:
+    table = Table(box=None, padding=(0, 1))
+    for title in ("tool set", "kept (UTC)", "tried", "axis", "settles in, s", "sensitivity peak"):
+        table.add_column(title, overflow="fold")
+    for tool in tools:
+        first = (tool.name, tool.kept[:16], "yes" if tool.verified else "NO")
+        rows = tool.figures or {"": {}}
+        for k, (axis, figures) in enumerate(rows.items()):
+            cells = [
+                "" if (value := figures.get(name)) is None else f"{value:.3g}"
+                for name in ("settling_time", "sensitivity_peak")
+            ]
+            table.add_row(*(Text(c) for c in ((*(first if k == 0 else ("",) * 3), axis, *cells))))
+    return table
+
+
+def _difference_table(a: ToolSet, b: ToolSet, differences: Sequence[Difference]) -> Table:
+    table = Table(box=None, padding=(0, 1))
+    for title in ("axis", "parameter", "object", f"{a.name} (drive)", f"{b.name} (drive)"):
+        table.add_column(title, overflow="fold")
+    for d in differences:
+        values = [
+            "" if v is None else f"{v:.7g}" if isinstance(v, float) else str(v)
+            for v in (d.one, d.other)
+        ]
+        table.add_row(*(Text(c) for c in (d.axis, d.name, str(d.address), *values)))
+    return table
