@@ -45,7 +45,7 @@ SMALL = 0.01
 """Error of the torque beyond its noise that does not matter."""
 NEAR_NOISE = 1.5
 """Error over noise (RMS) up to which it is all noise."""
-ENOUGH = 0.9
+ENOUGH, ENOUGH_KNOWN = 0.9, 0.97
 """Share of the explainable error that has to be explained for "explained"."""
 OTHER_UNIT = 5.0
 """Factor between measured and needed torque from which it is no fault of the machine."""
@@ -332,7 +332,18 @@ def _verdict(causes: Sequence[Cause], held: HeldOut) -> Verdict:
     left = {n for n in names if _matters(held.error_after[n].torque, held.noise_floor[n])}
     if not causes:
         return "unexplained" if left else "adequate"
-    if all(held.explained[n] >= ENOUGH for n in left):
+    # Beside a cause that has a name even little counts: it may be of another cause than of that one.
+    left |= {
+        n
+        for n, noise in held.noise_floor.items()
+        if noise is not None
+        and held.error_after[n].torque > NEAR_NOISE * noise
+        and held.explained[n] < ENOUGH_KNOWN
+        and any(n in (c.axis if isinstance(c.axis, tuple) else (c.axis,)) for c in causes)
+    }
+    if all(held.explained[n] >= ENOUGH for n in left if held.noise_floor[n] is None) and all(
+        held.explained[n] >= ENOUGH_KNOWN for n in left if held.noise_floor[n] is not None
+    ):
         return "explained"
     return "partly explained"
 

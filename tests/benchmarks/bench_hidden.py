@@ -75,7 +75,7 @@ def told(criticised, hidden):
 def judged(kind, case, without=frozenset(), with_told=False):
     """Criticise one case; return its line."""
     begin = time.process_time()
-    criticised = criticise(case.recording, case.machine.model, case.machine.model, without)
+    criticised = criticise(case.recording, case.machine.model, case.machine.model, without=without)
     seconds = time.process_time() - begin
     c = criticised.criticism
     first = c.causes[0] if c.causes else None

@@ -2,8 +2,9 @@
 
 The size is measured without the tool: the torque that the machine *without* the effect would have needed
 for the motion that was measured, by the plant's own dynamic stiffness at every frequency, is taken off
-the measured torque, both without noise.  What is left, over the noise of the torque in the same band, in
-the experiment and axis where that is largest, is the visibility.
+the measured torque, both without noise.  What is left, and what other numbers of the machine would not
+explain either, over the noise of the torque in the same band, in the axis where that is largest, is the
+visibility.
 """
 
 from collections.abc import Callable, Mapping
@@ -200,16 +201,53 @@ def unexplained(machine: Machine, recording: Recording) -> list[FloatArray]:
 def visibility(
     machine: Machine, hidden: Machine, seed: int, plain: list[FloatArray] | None = None
 ) -> float:
-    """Largest unexplained torque over the noise in its band, of experiments and axes."""
+    """Largest unexplained torque over the noise in its band, of experiments and axes.
+
+    What other numbers of the machine's own masses, springs, dampers and couplings would explain is taken
+    off: nobody could call that an effect.
+    """
     if plain is None:
         plain = unexplained(machine, record(machine, seed, noise=False, short=True))
-    changed = unexplained(machine, record(hidden, seed, noise=False, short=True))
+    measured = record(hidden, seed, noise=False, short=True)
+    changed = unexplained(machine, measured)
     noise = np.array([h.torque_noise for h in machine.hardware])
+    columns = [
+        _stacked([o - c for o, c in zip(unexplained(other, measured), changed, strict=True)], noise)
+        for other in nearby(machine)
+    ]
+    basis, _ = np.linalg.qr(np.column_stack(columns))
+    error = _stacked([c - p for c, p in zip(changed, plain, strict=True)], noise)
+    error -= basis @ (basis.T @ error)
     share = 2.0 * PERIOD * (BAND[1] - BAND[0])
-    return max(
-        float(np.max(np.sqrt(2.0 * np.sum(np.abs(c - p) ** 2, axis=0)) / (noise * share**0.5)))
-        for c, p in zip(changed, plain, strict=True)
-    )
+    lines = error.reshape(2, -1, noise.size)
+    return float(np.sqrt(2.0 * np.max(np.sum(lines**2, axis=(0, 1))) / share))
+
+
+def _stacked(spectra: list[FloatArray], noise: FloatArray) -> FloatArray:
+    """Real and imaginary parts of all lines over the noise of their axes, end to end."""
+    whole = np.concatenate(spectra) / noise
+    return np.concatenate([whole.real.ravel(), whole.imag.ravel()])
+
+
+def nearby(machine: Machine) -> list[Machine]:
+    """Machines of which one number each is a little larger."""
+    plant, out = machine.plant, []
+    for k, chain in enumerate(plant.chains):
+        for name in ("masses", "springs", "dampers"):
+            values = getattr(chain, name)
+            for j in range(len(values)):
+                more = tuple(v * (1 + 1e-4 * (i == j)) for i, v in enumerate(values))
+                chains = (*plant.chains[:k], replace(chain, **{name: more}), *plant.chains[k + 1 :])
+                out.append(replace(machine, plant=replace(plant, chains=chains)))
+        slower = replace(chain, viscous_friction=1.001 * chain.viscous_friction)
+        chains = (*plant.chains[:k], slower, *plant.chains[k + 1 :])
+        out.append(replace(machine, plant=replace(plant, chains=chains)))
+    for j in range(len(plant.couplings)):
+        couplings = tuple(
+            (a, b, m * (1 + 1e-4 * (i == j))) for i, (a, b, m) in enumerate(plant.couplings)
+        )
+        out.append(replace(machine, plant=replace(plant, couplings=couplings)))
+    return out
 
 
 def sized(machine: Machine, effect: str, axis: int, wanted: float, seed: int) -> Hidden | None:
@@ -233,7 +271,12 @@ def sized(machine: Machine, effect: str, axis: int, wanted: float, seed: int) ->
     return None
 
 
-def draw(seed: int, effects: tuple[str | None, ...] = (None,), wanted: float | None = None) -> Case:
+def draw(
+    seed: int,
+    effects: tuple[str | None, ...] = (None,),
+    wanted: float | None = None,
+    axes: int | None = None,
+) -> Case:
     """Draw a machine and hide effects in it, at axes drawn at random.
 
     Parameters
@@ -244,10 +287,12 @@ def draw(seed: int, effects: tuple[str | None, ...] = (None,), wanted: float | N
         Names; None is one at random.
     wanted
         Visibility of each; at random between 6 and 60 otherwise.
+    axes
+        Of the machine; one or two at random otherwise.
     """
     rng = np.random.default_rng(seed)
     while True:
-        machine = random_machine(rng)
+        machine = random_machine(rng, axes)
         hidden: list[Hidden] = []
         for name in effects:
             chosen = name or str(rng.choice(list(MAKERS)))

@@ -14,7 +14,7 @@ GAPS = (0.02, 0.2, 1.0, 4.0)
 """Start values of half the gap over the RMS of the elongation that rigid masses would ask for."""
 BRANCHES = 7
 """Maxwell branches that make damping nearly the same at all frequencies."""
-MODES = 20
+MODES = 16
 """Frequencies at which a further mass is tried."""
 
 

@@ -24,11 +24,14 @@ from fieldtool.criticise.search.rules import (
     Tried,
 )
 from fieldtool.criticise.search.significance import compared
+from fieldtool.criticise.where.sentences import relative_noise
 from fieldtool.criticise.where.views import views_of
 
 SHOWN = 0.3
 """Share of what an effect explains, that the view which it must show has to explain."""
 FEW_STEPS = 6
+MOST_OF_IT = 0.5
+"""Share of what is wrong of an axis, noise taken off, that its causes explain together at least."""
 OFF_ZERO = 3.0
 """Standard errors of a torque's zero, from which friction may differ between the directions instead."""
 DIRECTIONS = ("coulomb_friction", "asymmetric_friction")
@@ -210,6 +213,41 @@ def with_directions(
         else:
             out.append(Accepted(a.tried, (other, *a.ties)))
     return current, out
+
+
+def convincing(
+    prepared: Prepared,
+    before: Fitted,
+    current: Fitted,
+    accepted: Sequence[Accepted],
+    rejected: Reasons,
+) -> tuple[Fitted, list[Accepted]]:
+    """Give no name on an axis where all causes together leave more unexplained than they explain.
+
+    Whatever is left there would bend their numbers, and may be what they stand in for.
+    """
+    kept = list(accepted)
+    first = prepared.simulator.parts(before.hypothesis, "unseen")
+    there = relative_errors(first)
+    left = relative_errors(prepared.simulator.parts(current.hypothesis, "unseen"))
+    for axis in range(there.size):
+        noise = relative_noise(first, axis)
+        if noise is None or there[axis] <= noise**2:
+            continue
+        share = (there[axis] - left[axis]) / (there[axis] - noise**2)
+        alone = [a for a in kept if a.tried.effect.axis == axis and a.tried.effect.other is None]
+        if share >= MOST_OF_IT or not alone:
+            continue
+        for a in alone:
+            effect = a.tried.effect
+            why = (
+                f"explains no more than {100 * max(share, 0.0):.0f} % of what is wrong of its axis"
+            )
+            rejected[effect.key] = (effect, why)
+            kept.remove(a)
+            less = current.hypothesis.without(place_of(current.hypothesis, effect))
+            current = fit(prepared.simulator, less)
+    return current, kept
 
 
 def unharmful(

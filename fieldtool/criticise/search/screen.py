@@ -13,7 +13,7 @@ from fieldtool.criticise.search.hypothesis import Hypothesis, Simulator
 FloatArray = NDArray[np.float64]
 MOST_OF_IT = (0.0, 2.0)
 """Bounds of how much of a start value's torque the data may ask for."""
-NEARBY, MODE_STEP, DAMPINGS = 7, 0.12, (0.01, 0.06)
+NEARBY, MODE_STEP, DAMPINGS = 5, 0.12, (0.02,)
 """Frequencies tried about the best mode, their reach over it, and damping ratios."""
 SMALLEST_PART = 0.02
 """Of a start value, that is left of it at least."""

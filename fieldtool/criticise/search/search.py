@@ -12,6 +12,7 @@ from fieldtool.criticise.effects.base import Context, Effect
 from fieldtool.criticise.search.afterwards import (
     Accepted,
     Reasons,
+    convincing,
     place_of,
     pruned,
     tied,
@@ -26,6 +27,7 @@ from fieldtool.criticise.search.rules import (
     ALIKE_SHARE,
     ALIKE_T,
     BEYOND_NOISE,
+    CHANCE,
     LESS_MOVED,
     RELATED,
     STAYED,
@@ -47,6 +49,8 @@ SCREENING = 0.4
 MOST_TURNS = 6
 SETTLED = 1e-3
 """Change of a number of the machine over its size, from which fit and noise are found anew."""
+CLEAR = 0.9
+"""Share of what is not explained, from which no other start is tried."""
 ELSEWHERE, ELSEWHERE_LOOSE = 0.01, 0.3
 """Relative change of a mass, spring or coupling, and of a damper or friction, that bends a fit."""
 TRACE = 0.01
@@ -94,7 +98,7 @@ def search(
     prepared, before = settled(prepared, prepared.start)
     starts = [before.hypothesis]
     if accepted_base is not None and _elsewhere(before.hypothesis, accepted_base):
-        starts.append(replace(prepared.start, base=accepted_base))
+        starts.insert(0, replace(prepared.start, base=accepted_base))
     current, accepted = before, list[Accepted]()
     rejected: Reasons = {}
     for turn in range(ROUNDS):
@@ -116,6 +120,7 @@ def search(
     current, accepted = tied(prepared, current, accepted)
     before = fit(prepared.simulator, before.hypothesis)
     current, accepted = unharmful(prepared, before, current, accepted, rejected)
+    current, accepted = convincing(prepared, before, current, accepted, rejected)
     names = {a.tried.effect.key for a in accepted}
     names |= {t.effect.key for a in accepted for t in a.ties}
     current = current if accepted else before
@@ -205,6 +210,8 @@ def _round(
             key = one.effect.key
             if key not in best or fitted.cost < best[key].fitted.cost:
                 best[key] = judged(simulator, fitted, fitted.hypothesis.effects[-1], unseen)
+        if any(t.share >= CLEAR and t.gain.p <= CHANCE for t in best.values()):
+            break
     tried = list(best.values())
     good = []
     for candidate in tried:
