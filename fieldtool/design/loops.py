@@ -109,8 +109,9 @@ def _viscous(machine: Machine) -> FloatArray:
 
 def _states(servo: Servo, lag: float) -> int:
     t = servo.timing
-    filtered = (servo.velocity_filter != OFF) + (t.period > 0)
-    return filtered + 1 + 2 * len(servo.loop.filters) + 2 * (t.lag > TINY_LAG) + (lag > TINY_LAG)
+    filtered = int(servo.velocity_filter != OFF) + int(t.period > 0)
+    late = 2 * int(t.lag > TINY_LAG) + int(lag > TINY_LAG)
+    return filtered + 1 + 2 * len(servo.loop.filters) + late
 
 
 def _controller(
