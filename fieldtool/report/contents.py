@@ -11,7 +11,8 @@ from fieldtool.report.page import Page
 from fieldtool.report.part_causes import causes, gain, rejected, unexplained
 from fieldtool.report.part_done import done, facts, log, missing, warnings
 from fieldtool.report.part_machine import changed, numbers, responses
-from fieldtool.report.part_parameters import parameters, verification
+from fieldtool.report.part_parameters import parameters
+from fieldtool.report.part_verification import verification
 from fieldtool.report.part_wrong import wrong
 from fieldtool.report.section import Section
 from fieldtool.report.verdict import verdict

@@ -6,9 +6,6 @@ from typing import Any
 from fieldtool.report.material import Material
 from fieldtool.report.section import Block, Section, Table, Words
 
-DEPTH = 4
-"""Levels of a document that is shown as it is."""
-
 
 def parameters(material: Material) -> Section | None:
     """Show parameters before and after, and why they are what they are."""
@@ -73,30 +70,3 @@ def _number(value: Any) -> str:
     if value is None:
         return ""
     return f"{value:.6g}" if isinstance(value, int | float) else str(value)
-
-
-def verification(material: Material) -> Section | None:
-    """Show what the measurement after writing said, as its file has it."""
-    held = material.documents.get("verification")
-    if held is None:
-        return None
-    rows: list[tuple[str, ...]] = []
-    _flat("", held, rows, DEPTH)
-    said = held.get("sentence")
-    lead = said if isinstance(said, str) else ""
-    return Section("Prediction and verification", lead, (Table(("what", "value"), tuple(rows)),))
-
-
-def _flat(name: str, value: Any, rows: list[tuple[str, ...]], depth: int) -> None:
-    if isinstance(value, Mapping) and depth:
-        for key, item in value.items():
-            _flat(f"{name}, {key}" if name else str(key), item, rows, depth - 1)
-    elif isinstance(value, list) and depth and any(isinstance(v, Mapping | list) for v in value):
-        for k, item in enumerate(value):
-            label = item.get("axis") or item.get("name") if isinstance(item, Mapping) else None
-            _flat(
-                f"{name}, {label or k + 1}" if name else str(label or k + 1), item, rows, depth - 1
-            )
-    elif name not in ("format", "sentence"):
-        shown = ", ".join(map(str, value)) if isinstance(value, list) else _number(value)
-        rows.append((name.replace("_", " "), shown))

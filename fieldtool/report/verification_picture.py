@@ -17,6 +17,8 @@ from fieldtool.records.model import FloatArray
 BEFORE, PREDICTED, AFTER, REFERENCE = "#9aa5b1", "#d1495b", "#1f3b73", "#2b2b2b"
 History = tuple[FloatArray, ...] | None
 """Time, reference and position of a move from where it began."""
+POINTS = 240
+"""Of a move that is kept as numbers."""
 BANDS = 12.0
 """Half the height of the picture of the error, in bands about the target."""
 
@@ -44,10 +46,7 @@ def draw_verification(
     FigureCanvasAgg(figure)
     plots = figure.subplots(len(axes), 3, squeeze=False)
     for row, (k, (one, before, after)) in zip(plots, enumerate(axes), strict=True):
-        curves = prediction.axes[k].curves
-        foreseen: History = (
-            None if curves is None else (curves.time, curves.reference, curves.position)
-        )
+        foreseen = foreseen_move(prediction, k)
         _draw_move(row[0], one, before, foreseen, after)
         _draw_error(row[1], one, before, foreseen, after)
         _draw_sensitivity(row[2], one)
@@ -57,6 +56,27 @@ def draw_verification(
         figure.savefig(path, dpi=110)
     except OSError as error:
         raise OutputError(f"{path}: can not be written ({error.strerror})") from error
+
+
+def foreseen_move(prediction: Prediction, k: int) -> History:
+    """Return an axis' move as it was predicted; None where the machine would not be stable."""
+    curves = prediction.axes[k].curves
+    return None if curves is None else (curves.time, curves.reference, curves.position)
+
+
+def same_times(
+    one: Comparison, before: History, foreseen: History, after: History
+) -> dict[str, list[float]]:
+    """Return an axis' move out, before, predicted and after, at POINTS times in common."""
+    parts = _parts(one, before, foreseen, after)
+    known = [(name, part) for name, _, _, part in parts if part is not None]
+    if not known:
+        return {}
+    time = np.linspace(0, _end(one, parts), POINTS)
+    reference = known[0][1]
+    curves = {"time": time, "reference": np.interp(time, reference[0], reference[1])}
+    curves |= {name: np.interp(time, part[0], part[2]) for name, part in known}
+    return {name: [float(f"{v:.6g}") for v in values] for name, values in curves.items()}
 
 
 def _out(history: History, one: Comparison) -> tuple[FloatArray, FloatArray, FloatArray] | None:

@@ -337,6 +337,6 @@ def _with_excitation(
         plan.trial,
         excitation=excitation,
         excursion=EXCITED * done[0],
-        torque=np.minimum(EXCITED * done[3] + 0.05 * limits + np.array(steps) / 2, MOST * limits),
+        torque=np.minimum(EXCITED * done[3] + 0.05 * limits + 3 * np.array(steps), MOST * limits),
     )
     return replace(plan, trial=trial, lines=lines)

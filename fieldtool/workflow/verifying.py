@@ -36,7 +36,7 @@ from fieldtool.experiment.verification.trial import Tried, run_trial
 from fieldtool.records.model import FloatArray, MachineModel
 from fieldtool.records.recording import Experiment, RecordingWriter
 from fieldtool.records.yaml_file import write_yaml
-from fieldtool.report.verification_picture import draw_verification
+from fieldtool.report.verification_picture import draw_verification, foreseen_move, same_times
 from fieldtool.workflow.preparation import axes_of, recording_header, setting_of
 from fieldtool.workflow.session import Session
 from fieldtool.workflow.trial_plan import (
@@ -70,17 +70,30 @@ class Verified:
     cycle: float
     """s."""
     notes: tuple[str, ...] = ()
+    moves: tuple[dict[str, list[float]], ...] = ()
+    """Each axis' move out: time, reference, and position before, predicted, after, at the same times."""
+
+    @property
+    def sentence(self) -> str:
+        """What came of it, for a person."""
+        if self.verdict == "verified":
+            return "The new parameters stood their trial on the machine."
+        return f"The new parameters were taken back: {'; '.join(self.reasons)}"
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values, as ``verification.yaml`` and ``--json`` have them."""
         return {
             "format": FORMAT,
             "verdict": self.verdict,
+            "sentence": self.sentence,
             "reasons": list(self.reasons),
             "bound": self.bound,
             "model": self.model,
             "cycle": self.cycle,
-            "axes": [axis.as_dict() for axis in self.axes],
+            "axes": [
+                {**axis.as_dict(), "curves": curves}
+                for axis, curves in zip(self.axes, self.moves, strict=True)
+            ],
             "parameters": [
                 {
                     "axis": c.axis,
@@ -345,23 +358,29 @@ class Verification:
 
     def _conclude(self, tried: Tried | None, reasons: tuple[str, ...]) -> None:
         """Keep what was found; a disk that is full must not hide it."""
+        compared = self._compared(tried)
+        histories = [
+            (one, self._history(self._old, k), self._history(tried, k))
+            for k, one in enumerate(compared)
+        ]
+        moves = (
+            same_times(one, before, foreseen_move(self._planned.after, k), after)
+            for k, (one, before, after) in enumerate(histories)
+        )
         self.result = Verified(
             "restored" if reasons else "verified",
             reasons,
-            self._compared(tried),
+            compared,
             self._changes,
             self._bound,
             "identified" if self._believed else "prior",
             self._planned.trial.cycle_time,
             self._planned.notes,
+            tuple(moves),
         )
         folder = self._session.folder
         folder.note("verified", verdict=self.result.verdict, reasons=list(reasons))
         self._session.screen.verified(self.result)
-        histories = [
-            (one, self._history(self._old, k), self._history(tried, k))
-            for k, one in enumerate(self.result.axes)
-        ]
         try:
             write_yaml(folder.verification, self.result.as_dict())
             draw_verification(histories, self._planned.after, folder.verification_picture)

@@ -113,6 +113,9 @@ class WatchedMover:
 
     def __init__(self, group: Mover, watch: OscillationWatch, rests: list[Capture]) -> None:
         self._group, self._watch, self._rests = group, watch, rests
+        self.held = np.zeros(0)
+        """Targets at which the axes of the motion were seen to stand, shape (M,): going on from there is
+        no jolt, which it would be from where they are."""
 
     @contextmanager
     def motion(
@@ -129,6 +132,7 @@ class WatchedMover:
         with self._group.motion(cycle_time, free, torque_offset, self._watch) as motion:
             start = motion.position
             self._watch.hold(start)
+            self.held = start
             still = np.tile(start, (max(2, round(HOLD_TIME / cycle_time)), 1))
             self._rests.append(motion.stream(_slices(still, cycle_time)))
             yield motion
@@ -190,7 +194,7 @@ def run_trial(
     kept: list[Experiment] = []
     try:
         with mover.motion(trial.cycle_time) as motion:
-            start = motion.position
+            start = mover.held
             steps = _Steps(motion, watch, axes, still, start, name, kept)
             for move in trial.moves:
                 steps.nudge(move)
