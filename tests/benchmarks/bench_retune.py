@@ -107,7 +107,7 @@ def random_machine(rng: np.random.Generator) -> dict[str, Any]:
             names = [f"axis{a + 1}", f"axis{b + 1}"]
             for into, which in ((couplings, 0), (true_couplings, 1)):
                 size = share * float(np.sqrt(ends[a][which] * ends[b][which]))
-                into.append({"axes": names, "value": size})
+                into.append({"axes": list(names), "value": size})
     return {
         "format": "fieldtool-machine/1",
         "name": "random",
