@@ -6,6 +6,7 @@ from math import inf, isfinite, nan, pi
 from pathlib import Path
 
 import h5py
+import numpy as np
 
 from drives.canopen_drive.conversion import Conversion
 from drives.canopen_drive.group import profile_of
@@ -19,6 +20,8 @@ from fieldtool.design.servo import CAUTIOUS_LAG, CAUTIOUS_PERIOD, Timing
 from fieldtool.records.model import MachineModel
 from fieldtool.records.session_folder import SessionFolder
 
+SEEN = 20_000
+"""Rows of a recording in which the steps of its encoders are looked for."""
 REAL_LARGEST = {"REAL32": 3.4e38, "REAL64": 1.7e308}
 
 
@@ -77,6 +80,8 @@ class _Kept:
     rated_torque: float
     """NaN where nobody kept it."""
     counts_per_rev: float
+    step: float
+    """Smallest change of position that was recorded, rad or m; NaN where nothing was."""
 
 
 def drive_sides(
@@ -108,6 +113,8 @@ def _side(axis: AxisProfile, machine: MachineProfile, kept: _Kept, cycle: float)
         resolution = axis.feed / kept.counts_per_rev
     elif axis.kind == "rotary" and isfinite(kept.counts_per_rev):
         resolution = 2 * pi / kept.counts_per_rev
+    else:
+        resolution = kept.step
     conversion = _conversion(axis, profile, kept)
     present, why = _present(axis, profile, conversion, kept)
     return DriveSide(
@@ -134,14 +141,14 @@ def _kept(folder: SessionFolder, machine: MachineProfile) -> dict[str, _Kept]:
     numbers = _axes_of(folder.recording)
     out = {}
     for axis in machine.axes:
-        rated, counts = numbers.get(axis.name, (nan, nan))
+        rated, counts, step = numbers.get(axis.name, (nan, nan, nan))
         backup = backups.get(axis.name)
         lacking = why or f"{folder.parameters_before.name} has nothing of this axis."
         if axis.encoder_counts_per_rev is not None and not isfinite(counts):
             counts = float(axis.encoder_counts_per_rev)
         if backup is not None and not isfinite(counts):
             counts = float(_held(backup, ObjectAddress(0x608F, 1)) or nan)
-        out[axis.name] = _Kept(backup, "" if backup else lacking, rated, counts)
+        out[axis.name] = _Kept(backup, "" if backup else lacking, rated, counts, step)
     return out
 
 
@@ -152,19 +159,30 @@ def _held(backup: DriveBackup, address: ObjectAddress) -> float | None:
     return None
 
 
-def _axes_of(recording: Path) -> dict[str, tuple[float, float]]:
-    """Return rated torque and counts a revolution of each axis, as a recording keeps them."""
+def _axes_of(recording: Path) -> dict[str, tuple[float, float, float]]:
+    """Return rated torque, counts a revolution and step of each axis, as a recording keeps them."""
     try:
         with h5py.File(recording, "r") as file:
+            steps = _steps(file)
             return {
                 str(group.attrs.get("name", key)): (
                     float(group.attrs.get("rated_torque", nan)),
                     float(group.attrs.get("encoder_counts_per_rev", nan)),
+                    steps[k] if k < len(steps) else nan,
                 )
-                for key, group in file["axes"].items()
+                for k, (key, group) in enumerate(file["axes"].items())
             }
     except (OSError, KeyError, ValueError, TypeError):
         return {}
+
+
+def _steps(file: h5py.File) -> list[float]:
+    """Return the smallest change of position of each axis in the first experiment."""
+    for experiment in file["experiments"].values():
+        moved = np.abs(np.diff(experiment["position"][:SEEN], axis=0))
+        least = 1e-12 * max(float(moved.max(initial=0.0)), 1e-300)
+        return [float(one[one > least].min(initial=inf)) for one in moved.T]
+    return []
 
 
 def _sample_period(recording: Path) -> float:

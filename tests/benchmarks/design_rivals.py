@@ -121,13 +121,18 @@ def moved(
         loops = Loops(respond(machine, wave.omega), servos)
         motor, load, _ = loops.motion(k, servos[k].reference_gain(s) * shaped)
         reference, band = move.at(wave.time)[0], move.settling_band
-        half = 0.5 * move.distance
-        out.append(
-            tuple(
-                move_figures(wave.time, reference, wave.signal(x) + half, band)
-                for x in (motor, load)
-            )
-        )
+        ended = reference
+        if shaper is not None:
+            a, t = shaper
+            ended = sum(ai * move.at(wave.time - ti)[0] for ai, ti in zip(a, t, strict=True))
+        pair = []
+        for spectrum in (motor, load):
+            position = wave.signal(spectrum) + 0.5 * move.distance
+            figures = move_figures(wave.time, reference, position, band)
+            # what swings once the shaped reference has ended, too
+            swing = move_figures(wave.time, ended, position, band)
+            pair.append(replace(figures, residual_rms=swing.residual_rms))
+        out.append((pair[0], pair[1]))
     return out
 
 

@@ -1,0 +1,160 @@
+"""What a design is told of drives: from a backup as from the drive itself; what is said where not."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from drives.canopen_drive import connect
+from drives.parameters import back_up, planned_changes, read_loop, save_backup
+from drives.profile import load_machine
+from fieldtool.cli.main import main
+from fieldtool.records.model_file import write_model
+from fieldtool.records.recording import save
+from fieldtool.records.session_folder import SessionFolder
+from fieldtool.records.yaml_file import write_yaml
+from fieldtool.workflow.design_inputs import drive_sides, moves_of, timing_of
+from fieldtool.workflow.designing import redesign
+from fieldtool.workflow.models import truth_model
+from fieldtool.workflow.preparation import recording_header
+from fieldtool.workflow.session import _resolved
+from tests.faces import machine_of, simulated
+
+
+def session(tmp_path: Path, kinds: tuple[str, str], backup: bool = True) -> SessionFolder:
+    """A session folder as a run leaves it: profile, backup, model."""
+    folder = SessionFolder.create(tmp_path / "session")
+    machine = machine_of(kinds, tmp_path)
+    write_yaml(folder.machine, _resolved(machine))
+    model = truth_model(machine)
+    assert model is not None
+    write_model(model, folder.model)
+    if backup:
+        with simulated(machine), connect(machine) as group:
+            save_backup(back_up(machine.name, group.drives), folder.parameters_before)
+            save(recording_header(machine, group, 0.004, with_lengths=True), folder.recording)
+    return folder
+
+
+@pytest.mark.parametrize(
+    "kinds",
+    [("reference", "epos4"), ("novanta*", "reference"), ("epos4-dual-loop", "reference")],
+    ids=str,
+)
+def test_present_parameters_are_those_that_the_drive_tells(
+    tmp_path: Path, kinds: tuple[str, str]
+) -> None:
+    folder = session(tmp_path, kinds)
+    machine = machine_of(kinds, tmp_path)
+    sides = drive_sides(folder, machine, 0.004)
+    with simulated(machine), connect(machine) as group:
+        for side, drive in zip(sides, group.drives, strict=True):
+            if side.present is None:
+                pytest.fail(side.unreadable)
+            told = read_loop(drive)
+            assert {k: side.present[k] for k in told if k in side.present} == pytest.approx(told)
+            assert side.tunable == drive.profile.tunable
+            assert side.resolution == pytest.approx(drive.scaling.position)
+            # what the design rounds to is what a write would leave in the drive
+            wanted = {k: 1.2345 * v for k, v in told.items() if k in ("velocity_p", "inertia_ff")}
+            wanted |= {k: told[k] for k in ("position_p", "velocity_p", "velocity_i")}
+            held = side.held(wanted)
+            for change in planned_changes(drive, {k: v for k, v in held.items() if k in wanted}):
+                if change.name in held:
+                    assert change.after == pytest.approx(held[change.name], rel=1e-6)
+
+
+def test_without_a_backup_the_design_stands_and_says_so(tmp_path: Path) -> None:
+    folder = session(tmp_path, ("reference", "reference"), backup=False)
+    tuning = redesign(folder.path, picture=tmp_path / "design.png")
+    assert tuning.present is None
+    assert any("no parameters-before.yaml" in note for note in tuning.notes)
+    assert (tmp_path / "design.png").read_bytes()[:4] == b"\x89PNG"
+    folder.parameters_before.write_text("nonsense: [")
+    machine = load_machine(folder.machine)
+    assert all("parameters-before.yaml" in s.unreadable for s in drive_sides(folder, machine))
+
+
+def test_the_command_says_what_is_there_and_what_will_be(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = session(tmp_path, ("reference", "reference"))
+    main_code(["design", str(folder.path), "--response", "soft", "--json"])
+    data = yaml.safe_load(capsys.readouterr().out)
+    assert data["response"] == "soft"
+    assert data["bound"] == pytest.approx(1.4)
+    for axis in data["prediction"]["axes"]:
+        assert axis["margins"]["sensitivity_peak"] <= 1.4 * 1.02
+    assert data["present"]["stable"] is True
+    assert yaml.safe_load(folder.tuning.read_text()) == data
+    assert main_code(["design", str(folder.path), "--response", "wild"]) == 2
+    assert main_code(["design", str(folder.path), "--bound", "1"]) == 2
+    before = folder.tuning.read_bytes()
+    folder.model.unlink()
+    assert main_code(["design", str(folder.path)]) == 2
+    assert folder.tuning.read_bytes() == before
+
+
+def main_code(arguments: list[str]) -> int:
+    try:
+        main(arguments)
+    except SystemExit as ended:
+        return int(ended.code or 0)
+    return 0
+
+
+def test_moves_and_timing_of_profiles(tmp_path: Path) -> None:
+    machine = machine_of(("reference", "reference"), tmp_path)
+    model = truth_model(machine)
+    assert model is not None
+    usual = moves_of(machine, model)
+    for move, axis, chain in zip(usual, machine.axes, model.axes, strict=True):
+        assert move.velocity <= 0.5 * axis.limits.velocity
+        assert move.acceleration * chain.total_mass <= 0.5 * axis.limits.torque * (1 + 1e-9)
+    data = yaml.safe_load(machine.path.read_text())
+    data["axes"][0]["typical_move"] = {
+        "distance": 0.2,
+        "velocity": 2.0,
+        "acceleration": 40.0,
+        "band": 0.001,
+    }
+    path = tmp_path / "moving.yaml"
+    path.write_text(yaml.safe_dump(data, sort_keys=False))
+    move = moves_of(load_machine(path), model)[0]
+    assert (move.distance, move.velocity, move.settling_band) == (0.2, 2.0, 0.001)
+    assert move.jerk == pytest.approx(40.0 / (0.25 * 2.0 / 40.0))
+    data["axes"][0]["typical_move"]["velocity"] = 1e6
+    path.write_text(yaml.safe_dump(data, sort_keys=False))
+    with pytest.raises(Exception, match=r"1e.06 is more than the limits allow"):
+        load_machine(path)
+    from drives.canopen_drive.group import profile_of
+
+    known = timing_of(profile_of(machine.axes[0], machine), 0.002)
+    assert (known.lag, known.period, known.cycle) == (
+        pytest.approx(0.22e-3),
+        pytest.approx(0.125e-3),
+        0.002,
+    )
+    silent = profile_of(machine.axes[0], machine).model_copy(
+        update={"torque_lag": 0.0, "loop_period": "unknown"}
+    )
+    assert timing_of(silent).lag == pytest.approx(1e-3)
+    assert np.isfinite(timing_of(silent).period)
+
+
+def test_a_pid_that_no_cascade_is_can_not_be_compared(tmp_path: Path) -> None:
+    folder = session(tmp_path, ("reference", "epos4"))
+    text = folder.parameters_before.read_text()
+    data = yaml.safe_load(text)
+    for item in data["drives"][1]["objects"]:
+        if item["object"] == "0x30A1:02":
+            item["value"] = 4_000_000_000
+    from drives.parameters.backup import checksum
+
+    data["checksum"] = checksum(data["drives"])
+    folder.parameters_before.write_text(yaml.safe_dump(data, sort_keys=False))
+    machine = load_machine(folder.machine)
+    side = drive_sides(folder, machine)[1]
+    assert side.present is None
+    assert "none that position P and velocity PI could be" in side.unreadable
