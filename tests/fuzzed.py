@@ -91,9 +91,7 @@ def changed_yaml(draw: st.DrawFn, text: str) -> bytes:
         return yaml.safe_dump(data, sort_keys=False).encode()
     raw = text.encode()
     if way == "word":
-        node = yaml.compose(text)
-        scalars = [(n.start_mark.index, n.end_mark.index) for n in _scalars(node)]
-        begin, end = draw(st.sampled_from(scalars))
+        begin, end = draw(st.sampled_from(scalars_of(text)))
         return (text[:begin] + draw(st.sampled_from(RAW)) + text[end:]).encode()
     return noisy(draw, raw)
 
@@ -102,6 +100,11 @@ def noisy(draw: st.DrawFn, raw: bytes) -> bytes:
     """Bytes with some replaced, left out or put in."""
     at, left_out = draw(st.integers(0, len(raw))), draw(st.integers(0, 40))
     return raw[:at] + draw(st.binary(max_size=40)) + raw[at + left_out :]
+
+
+def scalars_of(text: str) -> list[tuple[int, int]]:
+    """Where each word of a YAML text begins and ends."""
+    return [(n.start_mark.index, n.end_mark.index) for n in _scalars(yaml.compose(text))]
 
 
 def _scalars(node: yaml.Node) -> Iterator[yaml.ScalarNode]:

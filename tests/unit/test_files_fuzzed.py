@@ -2,6 +2,7 @@
 
 import math
 import shutil
+import time
 from dataclasses import replace
 from importlib.resources import files
 
@@ -12,7 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drives.errors import ProfileError
-from drives.profile import load_machine, packaged
+from drives.parameters import load_backup, load_journal
+from drives.profile import load_drive, load_machine, packaged
 from drives.sim.machine import simulated_machine
 from fieldtool.design.tuning import AxisTuning, Tuning
 from fieldtool.design.tuning_file import read_tuning, tuning_as_dict
@@ -21,6 +23,7 @@ from fieldtool.identify.multisine.identify import identify_joint
 from fieldtool.records.csv_folder import read_folder, write_folder
 from fieldtool.records.model import AxisModel, Coupling, Estimate, MachineModel
 from fieldtool.records.model_file import read_model, write_model
+from fieldtool.records.raw_rows import cut_off_rows
 from fieldtool.records.recording import (
     AxisInfo,
     Controller,
@@ -31,7 +34,7 @@ from fieldtool.records.recording import (
     save,
 )
 from fieldtool.records.yaml_file import write_yaml
-from tests.fuzzed import RAW, changed_yaml, in_words, noisy
+from tests.fuzzed import RAW, changed_yaml, in_words, noisy, scalars_of
 
 MACHINES = {
     name: files("profiles").joinpath("machines", f"{name}.yaml").read_text(encoding="utf-8")
@@ -78,6 +81,62 @@ def folder(tmp_path_factory):
     write_folder(recording(), made / "csv")
     save(recording(), made / "recording.h5")
     return made
+
+
+def _sparse(path, size):
+    """A file that is said to be so large, and takes no room."""
+    with path.open("wb") as file:
+        file.truncate(size)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("size", "read", "error"),
+    [
+        (1_000_001, load_machine, ProfileError),
+        (1_000_001, load_drive, ProfileError),
+        (2**30, load_backup, ProfileError),
+        (2**30, load_journal, ProfileError),
+        (2**20 + 1, read_model, FileFormatError),
+        (2**20 + 1, read_tuning, FileFormatError),
+        (16 * 2**30 + 1, load, FileFormatError),
+        (4 * 2**30 + 1, lambda path: cut_off_rows(path, recording()), FileFormatError),
+    ],
+    ids=["machine", "drive", "backup", "journal", "model", "tuning", "recording", "raw rows"],
+)
+def test_files_that_are_too_large_are_not_read(tmp_path, size, read, error):
+    path = _sparse(tmp_path / "large.yaml", size)
+    began = time.process_time()
+    with pytest.raises(error, match=r"large\.yaml.*(too large|MiB, the limit is)"):
+        read(path)
+    assert time.process_time() - began < 5.0
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.data())
+def test_nothing_in_a_profile_is_ever_run(folder, data):
+    """Whatever a value says: python, a shell, a template, a tag of YAML."""
+    marker = folder / "was-run"
+    python = f"__import__('pathlib').Path({str(marker)!r}).touch()"
+    words = [
+        python,
+        f"!!python/object/apply:os.system ['touch {marker}']",
+        f"!!python/object/new:os.system ['touch {marker}']",
+        f"$(touch {marker})",
+        f"`touch {marker}`",
+        "{{ " + python + " }}",
+        f"'{{{python}}}'",
+    ]
+    kind = data.draw(st.sampled_from(["machines", "drives"]))
+    name = data.draw(st.sampled_from(packaged(kind)))
+    shipped = files("profiles").joinpath(kind)
+    text = shipped.joinpath(f"{name}.yaml").read_text(encoding="utf-8")
+    begin, end = data.draw(st.sampled_from(scalars_of(text)))
+    path = folder / "code.yaml"
+    path.write_text(text[:begin] + data.draw(st.sampled_from(words)) + text[end:])
+    read = load_machine if kind == "machines" else load_drive
+    in_words(lambda: read(path), ProfileError)
+    assert not marker.exists()
 
 
 def numbers_in(value) -> list[float]:
