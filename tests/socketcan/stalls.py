@@ -78,7 +78,7 @@ def run_again_if_stalled(
                 item.ihook.pytest_runtest_logreport(report=report)
             break
         crash = getattr(failed[0].longrepr, "reprcrash", None)
-        why = " ".join(crash.message.split())[:200] if crash else failed[0].when
+        why = " ".join(crash.message.split())[-200:] if crash else failed[0].when
         say(
             f"{item.name}, attempt {attempt}: this computer stood still for {1000 * worst:.0f} ms "
             f"({why}); once more"

@@ -169,11 +169,14 @@ def test_an_interface_that_goes_down_in_a_sweep(
 
 
 def test_the_whole_job(drives, listener, tmp_path) -> None:
-    """``fieldtool run`` in a process of its own: identified, written, read back."""
+    """``fieldtool run`` in a process of its own: identified, written, read back.
+
+    Without the trials of old and new loops: more than a minute in real time.
+    """
     out = tmp_path / "session"
     command = [sys.executable, "-m", "fieldtool", "run", str(MACHINE), "--write", "--yes"]
     run = subprocess.run(
-        [*command, "--json", "--out", str(out)],
+        [*command, "--no-verify", "--json", "--out", str(out)],
         capture_output=True,
         text=True,
         timeout=3 * PATIENCE,

@@ -7,6 +7,7 @@ its move, then each makes its move and comes back, then all are excited a little
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -253,8 +254,11 @@ class _Steps:
         """Go the whole way, rest, come back, rest."""
         out, rest = move.reference, np.ones(move.rest)
         path = np.concatenate([out, move.distance * rest, move.distance - out, 0 * rest])
-        self._allow(move.axis, move.distance, move.torque, move.half_period)
-        self._stream(path, move.axis, f"{self._name}: move of {self._axes.names[move.axis]}")
+        allow = partial(self._allow, move.axis, move.distance, move.torque, move.half_period)
+        allow()
+        name = f"{self._name}: move of {self._axes.names[move.axis]}"
+        turn = out.size + move.rest, partial(allow, back=True)
+        self._stream(path, move.axis, name, turn=turn)
 
     def _allow(
         self,
@@ -264,21 +268,33 @@ class _Steps:
         half_period: float,
         *,
         gentle: bool = False,
+        back: bool = False,
     ) -> None:
+        """Allow an axis its way out, or the way back, which may be overshot at its own end."""
         errors = np.array([one.following_error for one in self._axes.limits])
         slack = np.maximum(CHECK_PUSHED * self._still, PUSHED_ERROR * errors)
         low, high = self._start - slack, self._start + slack
         slack_k = float(self._still[k])
-        ends = (-BEHIND * distance, (1 + BEYOND) * distance)
+        before, after = (BEYOND, BEHIND) if back else (BEHIND, BEYOND)
+        ends = (-before * distance, (1 + after) * distance)
         low[k] = self._start[k] + min(ends) - slack_k
         high[k] = self._start[k] + max(ends) + slack_k
         self._watch.move(low, high, torque, half_period, gentle=gentle)
 
-    def _stream(self, path: FloatArray, k: int, name: str, *, keep: bool = True) -> None:
+    def _stream(
+        self,
+        path: FloatArray,
+        k: int,
+        name: str,
+        *,
+        keep: bool = True,
+        turn: "Turn | None" = None,
+    ) -> None:
+        """Follow a path."""
         targets = np.tile(self._start, (path.size, 1))
         targets[:, k] += path
         try:
-            capture = self._motion.stream(_slices(targets, self._motion.cycle_time))
+            capture = self._motion.stream(_slices(targets, self._motion.cycle_time, turn))
         except StoppedError as error:
             if isinstance(error.capture, Capture) and error.capture.rows > 1:
                 self._kept.append(self._experiment(error.capture, k, name, str(error)))
@@ -330,19 +346,29 @@ class _Excited:
             yield motion
 
 
-def _slices(targets: FloatArray, step: float) -> "_Slices":
-    return _Slices(targets, max(2, round(SLICE_TIME / step)))
+Turn = tuple[int, Callable[[], None]]
+"""A row, and what is done before it is sent."""
+
+
+def _slices(targets: FloatArray, step: float, turn: Turn | None = None) -> "_Slices":
+    return _Slices(targets, max(2, round(SLICE_TIME / step)), turn)
 
 
 class _Slices:
     """Targets in slices; a ``drives.api.Source``."""
 
-    def __init__(self, targets: FloatArray, rows: int) -> None:
-        self._targets, self._rows, self._done = targets, rows, 0
+    def __init__(self, targets: FloatArray, rows: int, turn: Turn | None = None) -> None:
+        self._targets, self._rows, self._done, self._turn = targets, rows, 0, turn
 
     def __call__(self, _before: Capture | None) -> FloatArray | None:
         if self._done >= self._targets.shape[0]:
             return None
-        part = self._targets[self._done : self._done + self._rows]
+        end = self._done + self._rows
+        if self._turn is not None and self._done == self._turn[0]:
+            self._turn[1]()
+            self._turn = None
+        if self._turn is not None and self._done < self._turn[0]:
+            end = min(end, self._turn[0])
+        part = self._targets[self._done : end]
         self._done += part.shape[0]
         return part
