@@ -6,7 +6,7 @@ take, ``kernel_link`` and ``kernel_bus`` what only SocketCAN has, ``trouble`` re
 
 from can import BusABC as Bus
 
-from drives.bus.clock import Clock, WallClock, clock_of, not_imitated
+from drives.bus.clock import Clock, WallClock, clock_of, drives_begin_anew, not_imitated
 from drives.bus.load import (
     MAX_CYCLIC_LOAD,
     CyclicLoad,
@@ -26,6 +26,7 @@ __all__ = [
     "bus_state",
     "check_cycle",
     "clock_of",
+    "drives_begin_anew",
     "frame_bits",
     "not_imitated",
     "open_bus",

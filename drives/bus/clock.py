@@ -46,6 +46,14 @@ def clock_of(bus: can.BusABC) -> Clock:
     return cast(Clock, own) if own is not None else WallClock()
 
 
+def drives_begin_anew(bus: can.BusABC) -> bool:
+    """Return whether the drives begin with this bus: nothing of an earlier session is in them.
+
+    So it is with a machine that is simulated in this process, and never with a real one.
+    """
+    return bool(getattr(bus, "drives_begin_anew", False))
+
+
 def not_imitated(bus: can.BusABC) -> tuple[str, ...]:
     """Return what the bus says it does not imitate of a real one; empty for a real bus."""
     return tuple(getattr(bus, "not_imitated", ()))

@@ -11,6 +11,7 @@ from canopen.sdo import SdoAbortedError, SdoCommunicationError
 
 from drives import objects
 from drives.api import AxisLimits, DriveIdentity
+from drives.bus import drives_begin_anew
 from drives.canopen_drive.conversion import Conversion, quantity_objects
 from drives.canopen_drive.line import Line, Node
 from drives.canopen_drive.scaling import Scaled, read_scaling
@@ -307,6 +308,11 @@ class CanopenDrive:
         except DrivesError:
             return False
         return True
+
+    @property
+    def begins_anew(self) -> bool:
+        """Whether it was switched on with this bus: nothing of an earlier session is in it."""
+        return drives_begin_anew(self.line.can_bus)
 
     def wakes(self, patience: float) -> bool:
         """Whether the node answers, perhaps after it has booted, or was told to leave NMT stopped.

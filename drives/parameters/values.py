@@ -23,6 +23,10 @@ class ParameterDrive(Drive, Protocol):
     def axis_profile(self) -> AxisProfile:
         """What the machine profile says of the axis."""
 
+    @property
+    def begins_anew(self) -> bool:
+        """Whether it was switched on with this bus: nothing of an earlier session is in it."""
+
     def read(self, info: ObjectInfo, timeout: float | None = None) -> Raw:
         """Read an object; raise DrivesError where that fails."""
 

@@ -185,6 +185,9 @@ class LockstepBus(can.BusABC):
         self._owner = threading.get_ident()
         self._receive_own = receive_own_messages
         self._can_protocol = can.CanProtocol.CAN_20
+        known = str(channel) in _registered or str(channel) in _open_channels
+        self.drives_begin_anew = machine is None and not known
+        """Whether its drives were switched on with this bus, and end with the last one."""
         self._line = _open(channel, machine)
         self.channel = str(channel) if channel is not None else INTERFACE
         self.channel_info = f"{INTERFACE} {self.channel}: simulated machine in virtual time"

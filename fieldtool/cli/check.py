@@ -12,7 +12,7 @@ from rich.text import Text
 
 from fieldtool import workflow
 from fieldtool.cli.bus_options import Bitrate, Channel, Interface, on_bus
-from fieldtool.cli.output import console_of, print_json
+from fieldtool.cli.output import Json, console_of, print_json
 from fieldtool.cli.stop_key import somebody_there, stop_key
 from fieldtool.cli.tracing import TraceFile, TraceWanted, trace_path
 from fieldtool.experiment.checks.finding import Finding, Status
@@ -42,9 +42,7 @@ def check(
     bitrate: Bitrate = None,
     trace: TraceWanted = False,
     trace_file: TraceFile = None,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print one JSON object and nothing else.")
-    ] = False,
+    as_json: Json = False,
 ) -> None:
     """Check a machine before its first motion. MOVES EVERY AXIS A LITTLE, if you say so."""
     profile = on_bus(machine, interface, channel, bitrate)
@@ -53,6 +51,10 @@ def check(
     traced = trace_path(trace, trace_file, folder)
     if traced is not None and trace_file is None:
         folder.mkdir(parents=True, exist_ok=True)
+
+    simulated = workflow.simulated_words(profile)
+    if simulated:
+        console.print(Text(simulated, style="bold yellow"))
 
     def may_move() -> bool:
         if move is not None:

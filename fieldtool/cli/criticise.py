@@ -13,6 +13,7 @@ from rich.text import Text
 from fieldtool import workflow
 from fieldtool.cli.output import Json, console_of, print_json
 from fieldtool.criticise.criticism import Cause, Criticism
+from fieldtool.report.verdict import MEANING
 
 STYLES = {
     "adequate": "green",
@@ -46,6 +47,15 @@ def criticise(
     with SearchBar(console) as bar:
         found = workflow.criticise(source, model, picture, bar, report)
     show_criticism(console, found.criticism)
+    if source.is_dir():
+        console.print(
+            Text(
+                f"In {source}: criticism.yaml has all of it and what was rejected, report.html "
+                "shows it in a browser, criticism.png the errors."
+            )
+        )
+    elif report is not None:
+        console.print(Text(f"{report} shows it in a browser."))
     if as_json:
         print_json(
             {"criticism": found.criticism.as_dict(), "model": found.criticism.model.as_dict()}
@@ -86,7 +96,12 @@ class SearchBar:
 
 def show_criticism(console: Console, criticism: Criticism) -> None:
     """Show where it is wrong, the causes with their numbers, the gain, and what is left."""
-    console.print(Text(f"Verdict: {criticism.verdict}", style=STYLES[criticism.verdict]))
+    meaning = MEANING[criticism.verdict].removeprefix(f"{criticism.verdict}: ")
+    console.print(
+        Text(f"Verdict: {criticism.verdict}", style=STYLES[criticism.verdict]).append(
+            f" ({meaning})"
+        )
+    )
     for sentence in (*criticism.changes, *criticism.where):
         console.print(Text(f"  {sentence}"))
     if criticism.causes:

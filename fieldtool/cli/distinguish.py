@@ -9,7 +9,7 @@ from rich.text import Text
 
 from drives.profile import MachineProfile
 from fieldtool import workflow
-from fieldtool.cli.criticise import SearchBar, show_criticism
+from fieldtool.cli.criticise import show_criticism
 from fieldtool.cli.output import print_json
 from fieldtool.cli.stop_key import StopKey
 
@@ -35,21 +35,9 @@ def tell_apart(
     """Plan, measure and criticise, and show what it came to."""
     if options.plan != "fast":
         raise typer.BadParameter("--to-distinguish is for the fast plan")
-    with SearchBar(console) as bar:
-
-        def advance(what: str, share: float) -> None:
-            key.check()
-            bar(what, share)
-
-        done = workflow.distinguish(
-            machine,
-            earlier,
-            folder,
-            options,
-            screen=screen,
-            stop_requested=key,
-            advance=advance,
-        )
+    done = workflow.distinguish(
+        machine, earlier, folder, options, screen=screen, stop_requested=key
+    )
     show_criticism(console, done.criticism)
     console.print(Text(done.answer, style="bold"))
     console.print(Text(f"Both recordings, criticism and report are in {folder}."))

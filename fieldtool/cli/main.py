@@ -11,7 +11,7 @@ import traceback
 from collections.abc import Callable, Sequence
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, ParamSpec
 
 import typer
 from rich.console import Console
@@ -131,19 +131,32 @@ Motor = Annotated[
 ]
 
 
+P = ParamSpec("P")
+
+
 class _StoppableScreen:
-    """A screen at which a session ends between two stages, if the user asked for it."""
+    """A screen at which a session ends, if the user asked for it, before anything else is shown.
+
+    Sentences are shown all the same: they may be what a motion that was stopped has to say.
+    """
 
     def __init__(self, screen: workflow.Screen, key: StopKey) -> None:
         self._screen, self._key = screen, key
-        self.say, self.plan, self.progress = screen.say, screen.plan, screen.progress
-        self.ready, self.found, self.designed = screen.ready, screen.found, screen.designed
+        self.say, self.progress, self.ready = screen.say, screen.progress, screen.ready
+        self.stage = self._unless_stopped(screen.stage)
+        self.doing = self._unless_stopped(screen.doing)
+        self.plan = self._unless_stopped(screen.plan)
+        self.fast_plan = self._unless_stopped(screen.fast_plan)
+        self.found = self._unless_stopped(screen.found)
+        self.designed = self._unless_stopped(screen.designed)
         self.verified = screen.verified
-        self.fast_plan = screen.fast_plan
 
-    def stage(self, title: str) -> None:
-        self._key.check()
-        self._screen.stage(title)
+    def _unless_stopped(self, show: Callable[P, None]) -> Callable[P, None]:
+        def shown(*arguments: P.args, **named: P.kwargs) -> None:
+            self._key.check()
+            show(*arguments, **named)
+
+        return shown
 
 
 def _folder(out: Path | None, name: str) -> Path:
@@ -373,11 +386,13 @@ def identify(
     """Identify masses, springs, couplings and dampers from a recording."""
     console = console_of(as_json)
     options = _options("fast", False, False, motor_inertia, seconds)
-    planned = None
-    if plan_only:
-        found, planned = workflow.next_plan(source, options, _lengths(masses or []))
-    else:
-        found = workflow.identify(source, options, _lengths(masses or []))
+    planned, lengths = None, _lengths(masses or [])
+    with TerminalScreen(console) as screen:
+        screen.doing("find modes and numbers of masses, fit masses, springs, couplings and dampers")
+        if plan_only:
+            found, planned = workflow.next_plan(source, options, lengths)
+        else:
+            found = workflow.identify(source, options, lengths)
     if picture is not None:
         workflow.draw(found, picture)
     console.print(model_table(found.model, None, found.torque_units))

@@ -8,14 +8,13 @@ from rich.console import Console
 from rich.text import Text
 
 from drives.profile.schema import ProfileKind, json_schema
-from fieldtool.cli.output import console_of, print_json
+from fieldtool.cli.output import Json, console_of, print_json
 from fieldtool.workflow.profiling import CheckedProfile, check_profile, new_profile
 
 profile_app = typer.Typer(
     no_args_is_help=True,
     help="Profiles: begin one from an EDS file, check one, help an editor with their keys.",
 )
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")]
 
 
 @profile_app.command()

@@ -15,7 +15,7 @@ from rich.text import Text
 from drives.profile import BusProfile, MachineProfile
 from drives.scan import ScannedNode
 from fieldtool.cli.bus_options import Bitrate, Channel, Interface, channel_of, on_bus
-from fieldtool.cli.output import console_of, print_json
+from fieldtool.cli.output import Json, console_of, print_json
 from fieldtool.cli.tracing import TraceFile, trace_path
 from fieldtool.workflow.scanning import ScanResult
 from fieldtool.workflow.scanning import scan as scan_bus
@@ -52,9 +52,7 @@ def scan(
         typer.Option("--profile", help="Write a machine profile to be completed (FILE.yaml)."),
     ] = None,
     trace_file: TraceFile = None,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print one JSON object and nothing else.")
-    ] = False,
+    as_json: Json = False,
 ) -> None:
     """Show what is on the bus, and which drive profile fits. Writes nothing, changes no state."""
     bus, known = _bus(machine, interface, channel, bitrate)

@@ -7,7 +7,14 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
-from rich.progress import BarColumn, ProgressColumn, Task, TextColumn
+from rich.progress import (
+    BarColumn,
+    ProgressColumn,
+    SpinnerColumn,
+    Task,
+    TextColumn,
+    TimeElapsedColumn,
+)
 from rich.progress import Progress as Bar
 from rich.table import Table
 from rich.text import Text
@@ -57,7 +64,10 @@ class TerminalScreen:
     def __init__(self, console: Console, ask: Ask | None = None) -> None:
         self.console, self._ask = console, ask
         self._bar: Bar | None = None
+        self._busy: Bar | None = None
         self._task: Any = None
+        self._busy_task: Any = None
+        self._busy_since: float | None = None
         self._last_shown = 0.0
 
     def __enter__(self) -> "TerminalScreen":
@@ -76,6 +86,35 @@ class TerminalScreen:
         self._close()
         self.console.print(Text(f"▶ {title}", style="bold"))
 
+    def doing(self, what: str, share: float | None = None) -> None:
+        """Show what is computed, and for how long already; lines from time to time without a "
+        "terminal.
+        """
+        if not self.console.is_terminal:
+            if self._busy_since is None:
+                self._busy_since = self._last_shown = perf_counter()
+            elif perf_counter() - self._last_shown > QUIET_INTERVAL:
+                self._last_shown = perf_counter()
+                done = "" if share is None else f"{100 * share:.0f} %, "
+                self.console.print(
+                    Text(f"  {done}{_clock(self._last_shown - self._busy_since)}; {what}")
+                )
+            return
+        if self._busy is None:
+            self._busy = Bar(
+                TextColumn("  "),
+                SpinnerColumn(),
+                TextColumn("{task.description}", markup=False),
+                TimeElapsedColumn(),
+                console=self.console,
+                transient=True,
+                refresh_per_second=8,
+            )
+            self._busy.start()
+            self._busy_task = self._busy.add_task("")
+        done = "" if share is None else f"{100 * share:.0f} %  "
+        self._busy.update(self._busy_task, description=f"{done}{what}")
+
     def say(self, sentence: str) -> None:
         """Show a sentence."""
         console = self._bar.console if self._bar else self.console
@@ -83,6 +122,7 @@ class TerminalScreen:
 
     def plan(self, plan: SweepPlan, expected: Sequence[AxisForecast], duration: float) -> None:
         """Show what will move, how far, and for how long."""
+        self._close()
         sweeps = Table(title=None, box=None, padding=(0, 2))
         for title in ("axis moved", "how", "others floating", "tones", "Hz"):
             sweeps.add_column(title, style="cyan" if title == "axis moved" else "")
@@ -149,6 +189,7 @@ class TerminalScreen:
     def progress(self, progress: Progress | MultisineProgress) -> None:
         """Move the bar."""
         if self._bar is None:
+            self._close()
             self._bar = Bar(
                 TextColumn("  this pass"),
                 BarColumn(bar_width=20),
@@ -175,6 +216,7 @@ class TerminalScreen:
 
     def ready(self) -> bool:
         """Ask a person at the terminal; a script has decided by its call."""
+        self._close()
         if self._ask is None:
             return True
         return self._ask(
@@ -189,6 +231,7 @@ class TerminalScreen:
 
     def designed(self, tuning: Tuning) -> None:
         """Show why the new parameters are what they are."""
+        self._close()
         show_tuning(self.console, tuning)
 
     def verified(self, result: Verified) -> None:
@@ -200,6 +243,10 @@ class TerminalScreen:
             self.console.print(Text(f"  {words[result.verdict]}"))
 
     def _close(self) -> None:
+        self._busy_since = None
+        if self._busy is not None:
+            self._busy.stop()
+            self._busy = None
         if self._bar is not None:
             self._bar.stop()
             self._bar = None

@@ -97,6 +97,18 @@ def check_directions(group: Mover, axes: Axes, cycle_time: float, keep: Keep) ->
         keep(experiment)
 
 
+def small_moves(axes: Axes) -> str:
+    """Return in words how far each axis moves when its direction is checked."""
+    ways = [
+        f"{name} {CHECK_MOVE * (one.travel[1] - one.travel[0]):.3g} {axes.unit(k)}".strip()
+        for k, (name, one) in enumerate(zip(axes.names, axes.limits, strict=True))
+    ]
+    return (
+        f"Each in turn moves slowly by {100 * CHECK_MOVE:g} % of its travel and back, after a "
+        f"nudge of a tenth of that: {', '.join(ways)}."
+    )
+
+
 def _check_pace(axes: Axes) -> None:
     for name, limits in zip(axes.names, axes.limits, strict=True):
         way = limits.travel[1] - limits.travel[0]

@@ -9,7 +9,7 @@ from fieldtool.workflow.criticising import criticise_source as criticise
 from fieldtool.workflow.designing import redesign
 from fieldtool.workflow.distinguishing import Distinguished, distinguish
 from fieldtool.workflow.fast_measuring import plan
-from fieldtool.workflow.models import prior_model, truth_model
+from fieldtool.workflow.models import prior_model, simulated_words, truth_model
 from fieldtool.workflow.next_plan import next_plan
 from fieldtool.workflow.recordings import compare, export_folder, import_folder, simulate
 from fieldtool.workflow.reporting import report
@@ -52,6 +52,7 @@ __all__ = [
     "restore",
     "run",
     "simulate",
+    "simulated_words",
     "switch_tool",
     "tools_of",
     "truth_model",

@@ -130,7 +130,8 @@ def criticised(
         If the user asked for a stop; no axis moves at this stage.
     """
 
-    def advance(_what: str, _share: float) -> None:
+    def advance(what: str, share: float) -> None:
+        session.screen.doing(what, share)
         if stop_requested():
             raise UserStopError(
                 "stopped by the user while the simulation was criticised; no axis was moving, "

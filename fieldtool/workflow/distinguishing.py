@@ -26,7 +26,7 @@ from fieldtool.records.model import MachineModel
 from fieldtool.records.model_file import read_model, write_model
 from fieldtool.records.recording import Recording, load, save
 from fieldtool.records.session_folder import SessionFolder
-from fieldtool.workflow.criticising import Advance, alike, keep
+from fieldtool.workflow.criticising import alike, keep
 from fieldtool.workflow.fast_measuring import SEED, FastMeasurement
 from fieldtool.workflow.models import check_torque_scale, prior_model
 from fieldtool.workflow.planning import PlannedFast, Wanted, excitations, plan_main, plan_pilot
@@ -122,7 +122,6 @@ def distinguish(
     *,
     screen: Screen | None = None,
     stop_requested: Callable[[], bool] = never,
-    advance: Advance = lambda *_: None,
 ) -> Distinguished:
     """Plan and run the experiment that tells a cause from its rivals; criticise all data together.
 
@@ -136,8 +135,6 @@ def distinguish(
         New session folder: it gets both recordings.
     options, screen, stop_requested
         As for :func:`fieldtool.workflow.measure`.
-    advance
-        Told what is computed, and a number from 0 to 1.
 
     Raises
     ------
@@ -155,9 +152,9 @@ def distinguish(
         session.folder.note("question", earlier=str(earlier), words=question.words)
         before = session.folder.parameters_before
         with backed_up(profile.name, group.drives, before), group.without_feed_forward():
-            work = _Distinguishing(session, group, options, question, advance)
+            work = _Distinguishing(session, group, options, question)
             seconds = work.run()
-    found = _judged(session, question, advance)
+    found = _judged(session, question)
     answer = _answer(question.cause, found.criticism)
     session.folder.note("answer", words=answer)
     session.screen.say(answer)
@@ -165,7 +162,7 @@ def distinguish(
     return Distinguished(out, question.words, answer, found.criticism, seconds)
 
 
-def _judged(session: Session, question: Question, advance: Advance) -> Criticised:
+def _judged(session: Session, question: Question) -> Criticised:
     """Put both recordings into the new folder, and criticise them together."""
     session.screen.stage("Criticise with both recordings")
     folder = session.folder
@@ -174,7 +171,7 @@ def _judged(session: Session, question: Question, advance: Advance) -> Criticise
     both = replace(new, experiments=(*earlier, *new.experiments))
     save(both, folder.recording)
     write_model(question.model, folder.model)
-    found = criticise(both, question.model, question.prior, advance=advance)
+    found = criticise(both, question.model, question.prior, advance=session.screen.doing)
     keep(folder, found, question.model)
     return found
 
@@ -207,9 +204,8 @@ class _Distinguishing(FastMeasurement):
         group: CanopenGroup,
         options: Options,
         question: Question,
-        advance: Advance,
     ) -> None:
-        self._question, self._advance = question, advance
+        self._question = question
         super().__init__(session, group, options)
         step = question.recording.sample_period
         self._cycles = tuple(t for t in self._cycles if abs(t - step) < SAME_CYCLE)
@@ -235,13 +231,14 @@ class _Distinguishing(FastMeasurement):
             starting_model(question.model, question.prior),
             question.criticism,
             question.cause,
-            self._advance,
+            screen.doing,
         )
         noise = _noise(question.recording)
         pilot = plan_pilot(self._setting, cycle_time, self._times, SEED, self._offsets)
         main = plan_main(
-            self._setting, cycle_time, noise, self._times, Wanted(), SEED + 1, self._offsets
-        )
+            self._setting, cycle_time, noise, self._times, Wanted(), SEED + 1, self._offsets,
+            screen.doing,
+        )  # fmt: skip
         best = self._best(apart, main.plan)
         screen.say(f"Chosen: {best.words}.")
         self._chosen = best.plan
@@ -265,7 +262,7 @@ class _Distinguishing(FastMeasurement):
         tried: list[tuple[float, Proposal]] = []
         pair = frozenset({question.cause.effect, question.cause.ties[0].effect})
         for proposal in proposals(ground, pair):
-            self._advance(proposal.words, min(0.2 * len(tried), 0.9))
+            screen.doing(f"try in simulation: {proposal.words}")
             try:
                 evidence = apart.expected(expected_data(proposal.plan, self._setting))
             except NotEnoughDataError:

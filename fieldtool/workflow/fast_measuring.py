@@ -10,7 +10,7 @@ from drives.canopen_drive import CanopenGroup, connect
 from drives.errors import StoppedError, UserStopError
 from drives.profile import MachineProfile, load_machine
 from fieldtool.experiment.axes import Axes
-from fieldtool.experiment.directions import check_directions
+from fieldtool.experiment.directions import check_directions, small_moves
 from fieldtool.experiment.forecast import Setting
 from fieldtool.experiment.multisine.design import fast_cycle_times
 from fieldtool.experiment.multisine.forecast import experiment_peaks
@@ -23,6 +23,7 @@ from fieldtool.records.model import MachineModel
 from fieldtool.records.recording import Experiment, Recording, RecordingWriter
 from fieldtool.workflow.models import check_torque_scale, prior_model
 from fieldtool.workflow.planning import (
+    Advance,
     PlannedFast,
     Timing,
     Wanted,
@@ -76,7 +77,9 @@ def plan(
         setting = setting_of(profile, group, prior_model(profile))
         cycle_time = fast_cycle_times(setting.model, group.shortest_cycle)[0]
         times = timing(setting, options.excitation_time or usual_seconds(setting.model))
-        planned, _ = planned_before(group, setting, cycle_time, times)
+        planned, _ = planned_before(
+            group, setting, cycle_time, times, screen.doing if screen else lambda *_: None
+        )
         notes = window_notes(group, setting)
     if screen is not None:
         for note in (*_longer_than_asked(planned, options.excitation_time), *notes):
@@ -86,13 +89,18 @@ def plan(
 
 
 def planned_before(
-    group: CanopenGroup, setting: Setting, cycle_time: float, times: Timing
+    group: CanopenGroup,
+    setting: Setting,
+    cycle_time: float,
+    times: Timing,
+    advance: Advance = lambda *_: None,
 ) -> tuple[PlannedFast, MultisinePlan]:
     """Plan with the prior model, before anything has moved; return it all, and the pilot."""
     offsets = group.torque_offsets
+    advance("plan the pilot", 0.0)
     pilot = plan_pilot(setting, cycle_time, times, SEED, offsets)
     guess = _guessed_noise(group)
-    main = plan_main(setting, cycle_time, guess, times, Wanted(), SEED + 1, offsets)
+    main = plan_main(setting, cycle_time, guess, times, Wanted(), SEED + 1, offsets, advance)
     return replace(main, pilot=pilot), pilot
 
 
@@ -154,6 +162,7 @@ class FastMeasurement:
             keeping(session.folder, recording, group) as keep,
         ):
             session.screen.stage("Check that every axis moves the right way")
+            session.screen.say(small_moves(self._axes))
             late = group.late_cycles
             check_directions(group, self._axes, pilot.cycle_time, keep)
             rows = sum(e.samples for e in recording.recording.experiments)
@@ -193,7 +202,9 @@ class FastMeasurement:
         """Plan with the prior model, and show it; nothing has moved yet."""
         screen = self._session.screen
         screen.stage("Plan pilot and main experiments with the machine as last accepted")
-        planned, pilot = planned_before(self._group, self._setting, cycle_time, self._times)
+        planned, pilot = planned_before(
+            self._group, self._setting, cycle_time, self._times, screen.doing
+        )
         for note in _longer_than_asked(planned, self._asked):
             self._session.warn(note)
         for note in window_notes(self._group, self._setting):
@@ -206,6 +217,7 @@ class FastMeasurement:
     ) -> tuple[PlannedFast, Setting]:
         """Plan the main experiments with what the pilot found, and return what that is."""
         session = self._session
+        session.screen.doing("find noise, friction and modes in the pilot")
         found = read_pilot(recording, self._setting.model)
         check_torque_scale(found.torque_ratio, self._setting.model)
         for note in found.notes:
@@ -222,6 +234,7 @@ class FastMeasurement:
             self._wanted,
             SEED + 1,
             self._offsets,
+            session.screen.doing,
         )
         main = freed_of_friction(main, now_known, found.noise, found.friction)
         for note in main.plan.notes:

@@ -7,7 +7,7 @@ import numpy as np
 from drives.canopen_drive import CanopenGroup
 from drives.errors import UserStopError
 from fieldtool.errors import IdentificationError
-from fieldtool.experiment.directions import check_directions
+from fieldtool.experiment.directions import check_directions, small_moves
 from fieldtool.experiment.forecast import forecast
 from fieldtool.experiment.stepped.design import (
     chosen_cycle_time,
@@ -58,6 +58,7 @@ def _measure_both_passes(session: Session, group: CanopenGroup) -> float:
         keeping(folder, recording, group) as keep,
     ):
         screen.stage("Check that every axis moves the right way")
+        screen.say(small_moves(axes))
         check_directions(group, axes, cycle_time, keep)
         screen.stage("Measure, pass 1 of 2: an even grid over the band of the prior model")
         machine_time = run_plan(group, plan, axes, keep, screen.progress)

@@ -82,11 +82,23 @@ def check_believable(found: MachineModel, prior: MachineModel) -> None:
             )
 
 
+def is_simulated(machine: MachineProfile) -> bool:
+    """Whether its bus is that of a machine simulated in this process."""
+    return machine.simulation is not None and machine.bus.interface == "fieldsim"
+
+
 def truth_model(machine: MachineProfile) -> MachineModel | None:
     """Return what a simulated machine really is; None where the machine is real."""
-    if machine.simulation is None or machine.bus.interface != "fieldsim":
+    if machine.simulation is None or not is_simulated(machine):
         return None
     return _model(machine.simulation.axes, machine.simulation.couplings, machine)
+
+
+def simulated_words(machine: MachineProfile) -> str:
+    """Return what has to stand above all that is said of a simulated machine; empty for a real one."""
+    if not is_simulated(machine):
+        return ""
+    return "SIMULATED machine: nothing real is connected, and nothing real moves."
 
 
 def data_sheet_masses(machine: MachineProfile, options: Options) -> dict[str, Estimate]:

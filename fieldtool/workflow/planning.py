@@ -1,6 +1,6 @@
 """Plan the fast measurement: how long, which lines, how strong, and how well it will tell."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -44,6 +44,9 @@ LONG_ENOUGH = 2.5
 """Of the shortest period, from which an experiment has a period more."""
 PILOT_SHAPE = Shape(-0.75)
 """Spread of the pilot: the machine as last accepted is not worth a finer one."""
+LENGTHS_SHARE = 0.7
+"""Of the time that planning takes, for finding the period."""
+Advance = Callable[[str, float], None]
 MARGIN = 2.0
 """Standard errors that the accuracy that is wanted has to cover."""
 
@@ -217,6 +220,7 @@ def plan_main(
     wanted: Wanted,
     seed: int,
     offsets: Sequence[bool] = (),
+    advance: Advance = lambda *_: None,
 ) -> PlannedFast:
     """Return the shortest plan that reaches what is wanted, or the best one in the time.
 
@@ -236,6 +240,8 @@ def plan_main(
         Of the random phases.
     offsets
         Which axes' drives take a torque offset.
+    advance
+        Told what is computed, and a number from 0 to 1.
 
     Raises
     ------
@@ -246,7 +252,11 @@ def plan_main(
     counts = sorted({times.periods, PERIODS}, reverse=True)  # a slower machine than was thought
     tried = ((n, _periods(setting, cycle_time, times, n)) for n in counts)
     count, lengths = next((one for one in tried if one[1]), (PERIODS, []))
-    for period in lengths:
+    for k, period in enumerate(lengths):
+        advance(
+            f"choose lines and amplitudes: period {k + 1} of at most {len(lengths)}, {period:.3g} s",
+            LENGTHS_SHARE * k / len(lengths),
+        )
         found = _candidate(setting, noise, period, count, cycle_time, wanted, offsets)
         if chosen is None or found.loss < chosen.loss:
             chosen = found
@@ -259,6 +269,7 @@ def plan_main(
             f"experiments in all; {times.seconds_left:.3g} s were left for them: allow more time "
             f"(--time {_enough(setting, times):.0f})"
         )
+    advance("choose phases, and simulate the experiments within the limits", LENGTHS_SHARE)
     plan = experiments_for(
         setting,
         cycle_time,

@@ -25,7 +25,7 @@ from fieldtool.records.yaml_file import MAX_BYTES
 from fieldtool.report.contents import page_of
 from fieldtool.report.material import Material
 from fieldtool.report.page import write_page
-from fieldtool.workflow.models import prior_model, truth_model
+from fieldtool.workflow.models import is_simulated, prior_model, truth_model
 from fieldtool.workflow.rescued import rescue
 
 DOCUMENTS = ("prediction", "verification")
@@ -113,7 +113,7 @@ def material_of(folder: SessionFolder) -> Material:
     return Material(
         name=folder.path.resolve().name,
         machine=machine,
-        simulated=machine is not None and truth_model(machine) is not None,
+        simulated=machine is not None and is_simulated(machine),
         prior=_prior(machine),
         truth=truth_model(machine) if machine else None,
         recording=recording,

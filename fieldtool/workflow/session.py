@@ -44,6 +44,9 @@ class Screen(Protocol):
     def say(self, sentence: str) -> None:
         """Something that a person should know."""
 
+    def doing(self, what: str, share: float | None = None) -> None:
+        """Something is computed that may take a while; ``share`` of it is done, 0 to 1, where known."""
+
     def plan(self, plan: SweepPlan, expected: Sequence[AxisForecast], duration: float) -> None:
         """A plan was made and checked; nothing of it has moved yet."""
 
@@ -73,6 +76,9 @@ class Quiet:
         """Show nothing."""
 
     def say(self, sentence: str) -> None:
+        """Show nothing."""
+
+    def doing(self, what: str, share: float | None = None) -> None:
         """Show nothing."""
 
     def plan(self, plan: SweepPlan, expected: Sequence[AxisForecast], duration: float) -> None:

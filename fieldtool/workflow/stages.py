@@ -36,6 +36,7 @@ from fieldtool.workflow.models import (
     check_believable,
     data_sheet_masses,
     prior_model,
+    simulated_words,
     truth_model,
 )
 from fieldtool.workflow.reporting import report
@@ -105,7 +106,9 @@ def run(
             session.screen.found(identified.model, truth_model(session.machine))
             model, criticism = criticised(session, identified.model, stop_requested)
             session.screen.stage("Design new controller parameters")
-            tuning = _design(session.folder, session.machine, model, options.response)
+            tuning = _design(
+                session.folder, session.machine, model, options.response, session.screen.doing
+            )
             session.screen.designed(tuning)
             if stop_requested():
                 raise UserStopError(
@@ -298,6 +301,9 @@ def restore(
     axes = tuple(axis for axis in profile.axes if axis.name not in without)
     profile = profile.model_copy(update={"axes": axes})
     screen.stage(f"Connect to {profile.name}")
+    simulated = simulated_words(profile)
+    if simulated:
+        screen.say(simulated)
     with connect(profile, trace=trace, to_move=False) as group:
         screen.stage("Bring the old parameters back")
         return bring_back(
@@ -354,6 +360,9 @@ def _tell_punctuality(session: Session, group: CanopenGroup) -> None:
 def _identify(session: Session, options: Options) -> Identified:
     session.screen.stage("Identify masses, springs, couplings and dampers")
     machine = session.machine
+    session.screen.doing(
+        "find modes and numbers of masses, fit masses, springs, couplings and dampers"
+    )
     identified = identify_recording(
         load(session.folder.recording),
         {},
@@ -409,7 +418,11 @@ def _band(identified: Identified) -> ModelBand | None:
 
 
 def _design(
-    folder: SessionFolder, machine: MachineProfile, model: MachineModel, response: str
+    folder: SessionFolder,
+    machine: MachineProfile,
+    model: MachineModel,
+    response: str,
+    advance: Callable[[str, float], None],
 ) -> Tuning:
     check_known(model)
-    return designed(folder, machine, model, response)
+    return designed(folder, machine, model, response, advance=advance)

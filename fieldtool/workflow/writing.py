@@ -95,7 +95,6 @@ def written(
     )
     session.folder.note("parameters", rows=parameter_table(result))
     session.folder.note("write", written=result.in_memory, stored=result.stored)
-    session.screen.say(result.sentence)
     if result.in_memory and verification is None:
         session.warn("The new parameters were not tried on the machine (--no-verify).")
     return result, verification.result if verification else None

@@ -141,6 +141,9 @@ def state_folder(what: str = "unfinished") -> Path:
 def refuse_unfinished(machine: str, drives: Sequence[ParameterDrive], session: Path) -> None:
     """Refuse to go on where a write into one of these drives was cut off.
 
+    Drives that are simulated in this process have nothing of an earlier one in them: what was cut off
+    there ended with them.
+
     Parameters
     ----------
     machine
@@ -156,6 +159,9 @@ def refuse_unfinished(machine: str, drives: Sequence[ParameterDrive], session: P
         With the command that takes it back.
     """
     recorded = [_Identified(drive) for drive in drives]
+    if recorded and all(drive.begins_anew for drive in drives):
+        _forget(machine, recorded)
+        return
     for one in recorded:
         note = _note_of(machine, one)
         if note.exists():
@@ -172,6 +178,13 @@ def refuse_unfinished(machine: str, drives: Sequence[ParameterDrive], session: P
             axis = None if found is None else _same_drive(found, recorded, own=own)
             if found is not None and axis is not None:
                 raise _refusal(journal_file.parent, axis, found)
+
+
+def _forget(machine: str, recorded: Sequence["_Identified"]) -> None:
+    """Remove the notes about drives that are gone."""
+    with suppress(OSError):
+        for one in recorded:
+            remove_durably(_note_of(machine, one))
 
 
 def _lock_of(journal_file: Path) -> FileLock:

@@ -73,8 +73,8 @@ def test_with_nobody_to_ask_nothing_moves(small_bench) -> None:
     ("objects", "check", "status", "words"),
     [
         ({(0x6072, 0): 800}, "torque limit", "warn", "0x6072 is 3.2 N m"),
-        ({(0x6065, 0): REVOLUTION // 100}, "following error limit", "warn", "0x6065 is 0.06283"),
-        ({(0x607F, 0): REVOLUTION}, "velocity limit", "warn", "0x607F is 6.283 rad/s"),
+        ({(0x6065, 0): REVOLUTION // 100}, "following error limit", "warn", "0.06283 rad (0x6065)"),
+        ({(0x607F, 0): REVOLUTION}, "velocity limit", "warn", "6.283 rad/s (0x607F)"),
         (
             {(0x607D, 1): -REVOLUTION // 4, (0x607D, 2): REVOLUTION},
             "travel limits",
@@ -113,7 +113,11 @@ def test_every_fault_of_every_axis_is_in_one_table(bench) -> None:
 
 
 @pytest.mark.parametrize(
-    ("index", "sub", "word"), [(0x1016, 1, "no 0x1016"), (0x6007, 0, "no 0x6007")]
+    ("index", "sub", "word"),
+    [
+        (0x1016, 1, "no heartbeat consumer (0x1016)"),
+        (0x6007, 0, "no abort connection option (0x6007)"),
+    ],
 )
 def test_a_drive_that_would_not_stop_by_itself(
     small_bench, index: int, sub: int, word: str

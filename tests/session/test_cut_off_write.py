@@ -243,6 +243,21 @@ def test_the_next_session_is_refused_until_it_is_taken_back(session, cut_off, co
     assert session.command("write", other, "--yes").code == 0
 
 
+def test_drives_that_are_simulated_anew_ask_for_no_restore(session, cut_off):
+    """What was cut off in an earlier process ended with its simulated drives: a demo that was killed
+    keeps no other from beginning."""
+    cut_off(PER_DRIVE + 2)
+    assert notes()
+    anew = session.out.parent / "anew"
+    make_session(session, anew)
+    data = yaml.safe_load((anew / "machine.yaml").read_text())
+    data["bus"]["channel"] = str(anew / "machine.yaml")  # no machine of this name is running
+    (anew / "machine.yaml").write_text(yaml.safe_dump(data))
+    outcome = session.command("write", anew, "--yes")
+    assert outcome.code == 0, outcome.err
+    assert not notes()
+
+
 def test_another_user_finds_it_in_the_folder_beside(session, cut_off):
     cut_off(PER_DRIVE + 2)
     shutil.rmtree(os.environ["FIELDTOOL_STATE_DIR"])

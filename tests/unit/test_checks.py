@@ -81,8 +81,8 @@ def test_each_thing_that_is_wrong_is_found_alone(change, check: str, status: str
 @pytest.mark.parametrize(
     ("change", "reaction", "word"),
     [
-        ({"consumer_heartbeat": None}, 3, "no 0x1016"),
-        ({"abort_connection": None}, 3, "no 0x6007"),
+        ({"consumer_heartbeat": None}, 3, "no heartbeat consumer (0x1016)"),
+        ({"abort_connection": None}, 3, "no abort connection option (0x6007)"),
         ({}, None, "does not know"),
     ],
 )

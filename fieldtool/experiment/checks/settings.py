@@ -33,7 +33,7 @@ def _travel_limits(
             f"the drive has none of its own (0x607D); {profile}, and the tool alone watches it",
             "",
         )
-    found = f"0x607D is {s.travel[0]:.4g} to {s.travel[1]:.4g} {unit}; {profile}"
+    found = f"the drive's own are {s.travel[0]:.4g} to {s.travel[1]:.4g} {unit} (0x607D); {profile}"
     slack = 2 * s.count
     if s.travel[0] > low + slack or s.travel[1] < high - slack:
         return (
@@ -78,7 +78,7 @@ def _not_tighter(
     profile = f"the profile allows {allowed:.4g} {unit}"
     if own is None:
         return "pass", f"the drive has none of its own ({place}), or it is off; {profile}", ""
-    found = f"{place} is {own:.4g} {unit}; {profile}"
+    found = f"the drive's own is {own:.4g} {unit} ({place}); {profile}"
     if own < allowed * (1 - 1e-3):
         return (
             "warn",
@@ -211,9 +211,9 @@ def judge_fail_safe(axis: str, settings: DriveSettings, reaction: int | None) ->
     """
     check, lacking = "stops by itself", []
     if settings.consumer_heartbeat is None:
-        lacking.append("0x1016")
+        lacking.append("heartbeat consumer (0x1016)")
     if settings.abort_connection is None:
-        lacking.append("0x6007")
+        lacking.append("abort connection option (0x6007)")
     if lacking:
         return Finding(
             check,
@@ -226,17 +226,19 @@ def judge_fail_safe(axis: str, settings: DriveSettings, reaction: int | None) ->
         return Finding(
             check,
             "fail",
-            "the drive profile does not know which value of 0x6007 makes it stop",
+            "the drive profile does not know which abort connection option (0x6007) makes it stop",
             axis,
             "Find it in the drive's manual, and enter `heartbeat_reaction` in a drive profile of your "
             "own.",
         )
-    there = "0x1016, 0x6007" + ("" if settings.error_behaviour is None else ", 0x1029")
+    there = ["heartbeat consumer (0x1016)", "abort connection option (0x6007)"]
+    if settings.error_behaviour is not None:
+        there.append("error behaviour (0x1029)")
     coast = "; its quick stop would let it coast (0x605A = 0), a ramp is set for the time of motion"
     return Finding(
         check,
         "pass",
-        f"{there} are there and are set while it moves, then put back"
+        f"{', '.join(there)} are there; they are set while it moves, then put back"
         + (coast if settings.quick_stop == COAST else ""),
         axis,
     )
