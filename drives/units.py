@@ -60,6 +60,9 @@ def parse_quantity(text: object, *dimensions: str) -> float:
     number, unit = match.groups()
     unit = unit.replace("·", " ").replace("*", " ").replace("N.m", "N m").replace("²", "2")
     unit = {"Nm": "N m", "mNm": "mN m", "kNm": "kN m", "kgm2": "kg m2"}.get(unit, unit)
+    if unit not in known and unit.startswith(","):
+        point = f"{number}.{unit[1:]}"
+        raise ValueError(f"write the number with a point: {point}, not {text}")
     if unit not in known:
         raise ValueError(f"unit {unit!r} does not fit: needs {wanted}")
     value = float(number) * known[unit]

@@ -19,7 +19,11 @@ class ChainProfile(Part):
     def _lengths(self) -> "ChainProfile":
         n = len(self.masses)
         if len(self.springs) != n - 1:
-            raise ValueError(f"{n} masses need {n - 1} springs, got {len(self.springs)}")
+            more = " (numbers are written with a point, not with a comma)"
+            raise ValueError(
+                f"{n} masses need {n - 1} springs, got {len(self.springs)}"
+                + (more if len(self.springs) > n - 1 else "")
+            )
         if self.dampers and len(self.dampers) != n - 1:
             raise ValueError(f"{n} masses need {n - 1} dampers, got {len(self.dampers)}")
         return self

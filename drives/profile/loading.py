@@ -10,6 +10,7 @@ from pydantic import ValidationError
 from drives.errors import ProfileError
 from drives.profile.drive import DriveProfile
 from drives.profile.machine import MachineProfile
+from drives.profile.plain_words import place_words, problem_words
 from drives.profile.values import LocatedError
 from drives.profile.yaml_reader import Lines, Location, line_of, read_yaml
 
@@ -84,7 +85,7 @@ def _load(path: Path, model: type[P]) -> P:
     except ValidationError as error:
         location, message, first = _first_of(error, lines)
         raise ProfileError(
-            path, _sentence(location, message, first), line_of(lines, location)
+            path, _sentence(location, message, first, data), line_of(lines, location)
         ) from None
     return profile.model_copy(update={"path": path})
 
@@ -98,7 +99,7 @@ def _first_of(error: ValidationError, lines: Lines) -> tuple[Location, str, Mapp
     errors = error.errors()
     first = next((e for e in errors if e["type"] == "extra_forbidden"), errors[0])
     location = _in_file(first["loc"], lines, missing=first["type"] == "missing")
-    message = first["msg"].removeprefix("Value error, ")
+    message = problem_words(first)
     inner = first.get("ctx", {}).get("error")
     if isinstance(inner, LocatedError):
         location += inner.location
@@ -118,8 +119,8 @@ def _in_file(location: Location, lines: Lines, *, missing: bool = False) -> Loca
     return kept
 
 
-def _sentence(location: tuple[str | int, ...], message: str, error: Mapping[str, Any]) -> str:
-    where = ".".join(str(p) for p in location) or "the file"
+def _sentence(location: Location, message: str, error: Mapping[str, Any], data: Any) -> str:
+    where = place_words(location, data) or "the file"
     kind = error["type"]
     if kind == "missing":
         if "limits" in location:
@@ -127,8 +128,4 @@ def _sentence(location: tuple[str | int, ...], message: str, error: Mapping[str,
         return f"{where} is missing. Add it."
     if kind == "extra_forbidden":
         return f"{where} is not a known key. Check its spelling or take it out."
-    shown = error.get("input")
-    if isinstance(shown, int) and shown.bit_length() > LONGEST_NUMBER:
-        shown = f"of {shown.bit_length()} bits"
-    value = f" (value {shown!r})" if isinstance(shown, str | int | float | bool) else ""
-    return f"{where}: {message[0].lower()}{message[1:]}{value}."
+    return f"{where}: {message}."

@@ -6,6 +6,7 @@ from typing import Any
 import yaml
 
 from drives.errors import ProfileError
+from drives.profile.plain_words import syntax_words
 
 MAX_PROFILE_BYTES = 1_000_000
 MAX_DEPTH = 30
@@ -62,7 +63,7 @@ def read_yaml(path: Path, largest: int = MAX_PROFILE_BYTES) -> tuple[Any, Lines]
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         raise ProfileError(
-            path, f"is no YAML: {error.problem}", mark.line + 1 if mark else None
+            path, f"is no YAML: {syntax_words(error.problem)}", mark.line + 1 if mark else None
         ) from None
     except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
         raise ProfileError(path, f"is no YAML: {' '.join(str(error).split())}") from None

@@ -189,10 +189,12 @@ def show(console: Console, result: Replayed) -> None:
             f"{p.deviation * 1e6:.3g} us, shortest {p.shortest * 1000:.4g} ms, longest "
             f"{p.longest * 1000:.4g} ms; {p.late} late; {p.pauses} pauses."
         )
+        console.print(f"  {pace_words(p.syncs, p.late, p.pauses)}")
     console.print(
         f"Bus load: {100 * s.mean_load:.1f} % in the mean, {100 * s.peak_load:.1f} % at most over "
         "0.1 s (worst-case stuffing)."
     )
+    console.print(f"  {load_words(s.peak_load)}")
     if s.pdos:
         table = Table(box=None, padding=(0, 2))
         for title in ("PDOs of node", "received", "missing", "doubled"):
@@ -200,10 +202,17 @@ def show(console: Console, result: Replayed) -> None:
         for one in s.pdos:
             table.add_row(*map(str, (one.node, one.received, one.missing, one.doubled)))
         console.print(table)
+        console.print(
+            f"  {pdo_words(sum(p.missing for p in s.pdos), sum(p.doubled for p in s.pdos))}"
+        )
     for what, lines in (
-        ("SDO aborts", s.aborts),
-        ("Emergencies", s.emergencies),
-        ("Boot-ups", s.boots),
+        (
+            "SDO aborts (objects that a drive refused; many are asked for only to see whether it "
+            "has them)",
+            s.aborts,
+        ),
+        ("Emergencies (faults that drives told of by themselves)", s.emergencies),
+        ("Boot-ups (drives that were switched on, or reset)", s.boots),
     ):
         if lines:
             console.print(Text(f"{what}:"))
@@ -214,6 +223,47 @@ def show(console: Console, result: Replayed) -> None:
     if s.unanswered:
         console.print(f"SDO requests without an answer: {s.unanswered}.")
     _show_recording(console, result)
+
+
+LATE_SHARE = 0.01
+"""Of the cycles that may be late before it is said that it matters."""
+HIGH_LOAD = 0.9
+"""Of the bus' time: more leaves no room for anything else."""
+
+
+def pace_words(syncs: int, late: int, pauses: int) -> str:
+    """Say what the pace of the SYNCs means."""
+    if late > LATE_SHARE * max(syncs, 1):
+        said = (
+            "That many late cycles spoil data: close other programs, or use a longer cycle "
+            "(shortest_cycle in the machine profile)."
+        )
+    else:
+        said = "The cycles came as they should; a late one is measured again by itself."
+    if pauses:
+        said += " Pauses are where nothing was to move, as between experiments."
+    return said
+
+
+def load_words(peak: float) -> str:
+    """Say what the load of the bus means."""
+    if peak > HIGH_LOAD:
+        return (
+            "Above 90 % frames wait for each other: a higher bit rate or a longer cycle. "
+            "Simulated buses, where frames take no time, may show more than 100 %."
+        )
+    return "Below 90 % every frame has its place in the cycle."
+
+
+def pdo_words(missing: int, doubled: int) -> str:
+    """Say what missing and doubled PDOs mean."""
+    if not missing and not doubled:
+        return "Every drive answered every SYNC once, as it has to."
+    return (
+        "Each drive has to answer every SYNC once: missing ones point to a bad cable, a "
+        "termination or a drive that is too slow for the cycle, doubled ones to a second node "
+        "with the same id."
+    )
 
 
 def _show_recording(console: Console, result: Replayed) -> None:

@@ -10,14 +10,13 @@ from typing import Annotated, Any, TypeVar
 import yaml
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
+from drives.profile.plain_words import place_words, problem_words, syntax_words
 from fieldtool.errors import FileFormatError
 from fieldtool.records.files import MEBIBYTE, read_text, write_atomic
 
 MAX_BYTES = 1 * MEBIBYTE
 MAX_DEPTH = 30
 """Of lists and mappings inside each other."""
-LONGEST_NUMBER = 1000
-"""Bits of a whole number that is shown; Python refuses to write very long ones out."""
 Path_ = tuple[str | int, ...]
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -60,7 +59,7 @@ def read_checked(path: Path | str, schema: type[Model]) -> tuple[Model, Mapping[
         faults = error.errors(include_url=False)  # a misspelled key is unknown and missing at once
         first = min(faults, key=lambda fault: fault["type"] != "extra_forbidden")
         where = tuple(part for part in first["loc"] if not _names_a_type(part))
-        raise FileFormatError(path, _sentence(first, where), line_of(lines, where)) from error
+        raise FileFormatError(path, _sentence(first, where, data), line_of(lines, where)) from error
 
 
 def line_of(lines: Mapping[Path_, int], where: Sequence[str | int]) -> int | None:
@@ -100,21 +99,14 @@ def _names_a_type(part: str | int) -> bool:
     return isinstance(part, str) and (part.startswith("_") or "[" in part)
 
 
-def _sentence(error: Mapping[str, Any], where: Path_) -> str:
-    name = ".".join(str(part) for part in where) or "the file"
-    kind, given = error["type"], error.get("input")
+def _sentence(error: Mapping[str, Any], where: Path_, data: Any) -> str:
+    name = place_words(where, data) or "the file"
+    kind = error["type"]
     if kind == "missing":
         return f"the key '{name}' is missing."
     if kind == "extra_forbidden":
         return f"the key '{name}' is not known: check its spelling."
-    message = str(error["msg"]).removeprefix("Value error, ")
-    return f"'{name}': {message}; the file has {_shown(given)}."
-
-
-def _shown(given: object) -> str:
-    if isinstance(given, int) and given.bit_length() > LONGEST_NUMBER:
-        return f"a number of {given.bit_length()} bits"
-    return repr(given) if isinstance(given, str | int | float | bool | None) else "a structure"
+    return f"'{name}': {problem_words(error)}."
 
 
 def _parse(path: Path, text: str) -> tuple[Any, dict[Path_, int]]:
@@ -128,7 +120,7 @@ def _parse(path: Path, text: str) -> tuple[Any, dict[Path_, int]]:
         return yaml.safe_load(text), lines
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark
-        problem = f"is not valid YAML: {error.problem or error.context}."
+        problem = f"is not valid YAML: {syntax_words(error.problem or error.context)}."
         raise FileFormatError(path, problem, _line(mark)) from error
     except yaml.YAMLError as error:
         problem = " ".join(str(error).split())

@@ -72,14 +72,14 @@ def test_with_nobody_to_ask_nothing_moves(small_bench) -> None:
 @pytest.mark.parametrize(
     ("objects", "check", "status", "words"),
     [
-        ({(0x6072, 0): 800}, "torque limit", "warn", "0x6072 is 3.2 N m"),
+        ({(0x6072, 0): 800}, "torque limit", "warn", "3.2 N m (0x6072)"),
         ({(0x6065, 0): REVOLUTION // 100}, "following error limit", "warn", "0.06283 rad (0x6065)"),
         ({(0x607F, 0): REVOLUTION}, "velocity limit", "warn", "6.283 rad/s (0x607F)"),
         (
             {(0x607D, 1): -REVOLUTION // 4, (0x607D, 2): REVOLUTION},
             "travel limits",
             "fail",
-            "0x607D is -1.571 to 6.283 rad",
+            "-1.571 to 6.283 rad (0x607D)",
         ),
         ({(0x6076, 0): 400}, "torque unit", "fail", "15 times"),
         ({(0x608F, 1): 512}, "position unit", "fail", "one position unit is 0.01227 rad"),

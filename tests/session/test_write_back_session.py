@@ -390,7 +390,7 @@ def test_a_tuning_with_numbers_that_are_none_is_refused_with_its_line(session):
     write_tuning(session, {"velocity_p": float("nan")}, ("table",))
     outcome = write(session)
     assert outcome.code == 2
-    assert "tuning.yaml:4: 'axes.0.parameters.velocity_p'" in outcome.err
+    assert "tuning.yaml:4: 'axis number 1, parameters.velocity_p'" in outcome.err
     assert session.changed() == {}
 
 

@@ -56,12 +56,20 @@ def test_plain_numbers_stand_for_estimates(tmp_path: Path) -> None:
     ("old", "new", "words"),
     [
         ("fieldtool-model/1", "fieldtool-model/2", r"model\.yaml:1: 'format'"),
-        ("kind: linear", "kind: round", r"model\.yaml:\d+: 'axes.1.kind'.*'round'"),
-        ("kind: linear", "knid: linear", r"model\.yaml:\d+: the key 'axes.1.knid' is not known"),
-        ("value: 95.1", "value: heavy", r"model\.yaml:\d+: 'axes.1.masses.0.*the file has 'heavy'"),
+        ("kind: linear", "kind: round", r"model\.yaml:\d+: 'axis .*, kind'.*'round'"),
+        ("kind: linear", "knid: linear", r"model\.yaml:\d+: the key 'axis .*, knid' is not known"),
+        (
+            "value: 95.1",
+            "value: heavy",
+            r"model\.yaml:\d+: 'axis .*, masses, number 1.*not 'heavy'",
+        ),
         ("value: 95.1", "value: .inf", r"model\.yaml:\d+: .*finite"),
-        ("value: -0.25", "value: yes", r"model\.yaml:\d+: 'couplings.0.value': expected a number"),
-        ("measurement_delay", "time_lag", r"model\.yaml:\d+: 'effects.\d.effect'"),
+        (
+            "value: -0.25",
+            "value: yes",
+            r"model\.yaml:\d+: 'couplings, number 1, value': expected a number",
+        ),
+        ("measurement_delay", "time_lag", r"model\.yaml:\d+: 'effects, number \d, effect'"),
         (
             "axis: x\n",
             "axis: q\n",

@@ -498,11 +498,11 @@ def test_a_profile_gives_its_chains_friction(tmp_path: Path) -> None:
     [
         ("effect: coulomb_friktion", "coulomb_friction"),
         ("efect: coulomb_friction", "effect"),
-        ("torq: 0.5", r"simulation\.axes\.0\.effects\.0\.torq is not a known key"),
-        ("location: middle", r"effects\.0\.location.*'motor' or 'load'"),
-        ("torque: -0.5", r"effects\.0\.torque.*greater than or equal to 0"),
-        ("torque: .nan", r"effects\.0\.torque.*finite"),
-        ("torque: 0.5 N m", r"effects\.0\.torque.*number"),
+        ("torq: 0.5", r"axis .*, effects, number 1, torq is not a known key"),
+        ("location: middle", r"effects, number 1, location.*motor or load"),
+        ("torque: -0.5", r"effects, number 1, torque.*at least 0"),
+        ("torque: .nan", r"effects, number 1, torque.*finite"),
+        ("torque: 0.5 N m", r"effects, number 1, torque.*number"),
     ],
 )
 def test_a_wrong_effect_is_refused_with_file_and_line(

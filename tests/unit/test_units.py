@@ -69,7 +69,7 @@ def test_every_unit_was_tried_or_is_the_base_unit() -> None:
         ("", "got ''"),
         ("90 deg/s", "unit 'deg/s' does not fit"),
         ("90 degrees", "unit 'degrees' does not fit"),
-        ("1,5 rad", "unit ',5 rad' does not fit"),
+        ("1,5 rad", "write the number with a point: 1.5 rad"),
         ("1 2 rad", "unit '2 rad' does not fit"),
         ("nan rad", "got 'nan rad'"),
         ("inf rad", "got 'inf rad'"),

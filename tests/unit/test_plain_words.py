@@ -1,0 +1,66 @@
+"""What is wrong with a profile, said as to a technician: axis by name, list, point, tab."""
+
+import pytest
+
+from drives.errors import ProfileError
+from drives.profile import load_machine
+from drives.profile.plain_words import place_words
+
+GOOD = (
+    "format: fieldtool-machine/1\nname: m\nbus: {interface: fieldsim, channel: x}\naxes:\n"
+    "  - name: table\n    kind: rotary\n    node_id: 11\n    drive: reference\n    limits:\n"
+    "      travel: [-120 deg, 120 deg]\n      velocity: 10 rad/s\n      acceleration: 400 rad/s2\n"
+    "      torque: 6 N m\n      following_error: 30 deg\n    prior:\n      masses: [0.02, 0.025]\n"
+    "      springs: [190]\n"
+)
+PROGRAMMERS = (
+    "valid tuple",
+    "valid number",
+    "input should",
+    "axes.0",
+    "token",
+    "scalar",
+    "mapping",
+)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line", "said"),
+    [
+        ("springs: [190]", "springs: 190", 17, "axis table, prior.springs: a list in brackets"),
+        ("springs: [190]", "springs: [190,5]", 15, "written with a point, not with a comma"),
+        ("[0.02, 0.025]", "['0,02', 0.025]", 16, "number 1: a number is written with a point: 0.02"),
+        ("velocity: 10 rad", "velocity: 10,5 rad", 11, "write the number with a point: 10.5 rad/s"),
+        ("    kind: rotary", "\tkind: rotary", 6, "begins with a tab: indent with blanks"),
+        ("node_id: 11", "node_id: eleven", 7, "axis table, node_id: a whole number belongs here"),
+        ("kind: rotary", "kind: round", 6, "axis table, kind: has to be rotary or linear"),
+        ("travel: [-120 deg, ", "travel: [-120 deg, 0 deg, ", 10, "3 values stand here, at most 2"),
+        ("name: m\n", "name m\n", 3, "a key needs a colon"),
+        ("[0.02, 0.025]", "[0.02, -1]", 16, "axis table, prior.masses, number 2: has to be above 0"),
+        ("drive: reference", "drive: [1]", 8, "axis table, drive: text belongs here"),
+    ],
+)  # fmt: skip
+def test_a_fault_is_said_in_plain_words_with_its_line(tmp_path, old, new, line, said):
+    assert old in GOOD
+    path = tmp_path / "m.yaml"
+    path.write_text(GOOD.replace(old, new), encoding="utf-8")
+    with pytest.raises(ProfileError) as refused:
+        load_machine(path)
+    text = str(refused.value)
+    assert said in text
+    assert text.startswith(f"{path}:{line}: ")
+    assert not [word for word in PROGRAMMERS if word in text.removeprefix(str(path))]
+
+
+def test_places_are_named_as_people_name_them():
+    data = {
+        "axes": [{"name": "x"}, {"name": "y", "prior": {"masses": [1, 2]}}],
+        "simulation": {"axes": [{}, {"effects": [{}]}]},
+    }
+    assert place_words(("axes", 1, "prior", "masses", 1), data) == "axis y, prior.masses, number 2"
+    assert place_words(("simulation", "axes", 1, "effects", 0, "torque"), data) == (
+        "axis y, effects, number 1, torque"
+    )
+    assert place_words(("bus", "bitrate"), data) == "bus.bitrate"
+    assert place_words(("axes", 0, "name"), {"axes": [{}]}) == "axis number 1, name"
+    assert place_words((), data) == ""
