@@ -117,7 +117,7 @@ def pressing_during(monkeypatch, module, name, only_call=1):
     [
         ("measuring", "identify_recording", 1),
         ("stages", "identify_recording", 1),
-        ("stages", "design", 1),
+        ("stages", "designed", 1),
         ("writing", "apply", 1),
     ],
 )

@@ -143,7 +143,7 @@ def test_a_criticism_with_a_wrong_key_is_refused_with_its_line(session, tmp_path
     data["causes"][0]["gain"] = "much"
     path = tmp_path / "criticism.yaml"
     write_yaml(path, data)
-    with pytest.raises(FileFormatError, match=r"criticism.yaml:\d+: 'causes.0.gain'"):
+    with pytest.raises(FileFormatError, match=r"criticism.yaml:\d+: 'causes, number 1, gain'"):
         read_criticism(path, found.criticism.model)
 
 
