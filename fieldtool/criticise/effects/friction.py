@@ -1,9 +1,8 @@
 """Friction between a mass and ground: viscous, dry, Stribeck, and with a direction.
 
-Dry friction at the motor is a spring in series with a slider (Jenkins element): at rest it takes what
-there is, up to its limit, and after a turn it grows over the presliding distance.  Its limit is reached
-within the rounding velocity, limit tanh(abs(v) / rounding), for lubricated contacts do not
-jump.  In rows in which the axis may stand still nothing is compared: there friction is not known.
+Dry friction at the motor builds up over the presliding distance after each turn (Dahl's model).  Its
+limit is reached within the rounding velocity, limit tanh(abs(v) / rounding), for lubricated contacts do
+not jump.  In rows in which the axis may stand still nothing is compared: there friction is not known.
 """
 
 from dataclasses import replace
@@ -44,7 +43,7 @@ class CoulombFriction(Effect):
 
     name = "coulomb_friction"
     equation = "tau = torque sign(v); at rest up to torque"
-    source = "Coulomb 1785; presliding: Jenkins 1962 (spring and slider)"
+    source = "Coulomb 1785; presliding: Dahl, AIAA Journal 14, 1976"
     signature = "torque that follows the sign of the velocity and not its size; odd harmonics"
     contrary = "even harmonics; growth with the amplitude"
     shows = ("direction",)
@@ -55,7 +54,7 @@ class CoulombFriction(Effect):
             return None
         limit = values["torque"] * _rounded(motion, self.axis, values)
         position = np.ascontiguousarray(motion.smooth_position[:, self.axis])
-        return _signed_slider(position, limit, limit, values["presliding"])
+        return np.asarray(slider(position, limit, limit, values["presliding"]))
 
     def structure(self, structure: Structure, values: Values) -> Structure:
         """At the last mass, rounded around standstill."""
@@ -81,7 +80,7 @@ class StribeckFriction(Effect):
         limit = values["torque"] + values["extra"] * np.exp(-(speed**2))
         limit = limit * _rounded(motion, self.axis, values)
         position = np.ascontiguousarray(motion.smooth_position[:, self.axis])
-        return _signed_slider(position, limit, limit, values["presliding"])
+        return np.asarray(slider(position, limit, limit, values["presliding"]))
 
     def plain(self, values: Values) -> dict[str, tuple[float, str, tuple[str, ...]]]:
         """Breakaway as a whole, as it is usually stated."""
@@ -106,7 +105,7 @@ class AsymmetricFriction(Effect):
         velocity = motion.smooth_velocity[:, self.axis]
         rounded = _rounded(motion, self.axis, values)
         position = np.ascontiguousarray(motion.smooth_position[:, self.axis])
-        dry = _signed_slider(
+        dry = slider(
             position,
             values["coulomb_positive"] * rounded,
             values["coulomb_negative"] * rounded,
@@ -198,14 +197,6 @@ def friction_candidates(context: Context) -> list[Effect]:
 
 def _speed_unit(context: Context, axis: int) -> str:
     return f"{context.length_unit(axis)}/s"
-
-
-def _signed_slider(
-    position: FloatArray, forward: FloatArray, backward: FloatArray, reach: float
-) -> FloatArray:
-    """Return the slider's force, linear in its limits: a negative mean limit turns it round."""
-    sign = 1.0 if float(np.mean(forward + backward)) >= 0 else -1.0
-    return np.asarray(sign * slider(position, sign * forward, sign * backward, reach))
 
 
 def _rounded(motion: Motion, axis: int, values: Values) -> FloatArray:

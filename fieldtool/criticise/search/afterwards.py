@@ -143,8 +143,12 @@ def tied(
             enough = ALIKE_SHARE * max(first.gain.before - first.gain.after, 0.0)
             if worse.t >= ALIKE_T and worse.before - worse.after > enough:
                 continue
-            if first.effect.name != "measurement_delay" and _preferred(
-                prepared, fitted, current, enough
+            delayed = (
+                rival.effect.name == "measurement_delay" and rival.effect.axis == first.effect.axis
+            )
+            if delayed or (
+                first.effect.name != "measurement_delay"
+                and _preferred(prepared, fitted, current, enough)
             ):
                 ties.append(replace(first, fitted=current))
                 first, current = replace(rival, fitted=fitted), fitted

@@ -285,11 +285,12 @@ def _winner(prepared: Prepared, tried: Sequence[Tried], rejected: Reasons) -> Ac
         contained = (
             other.effect.axis == best.effect.axis and other.effect.name in best.effect.replaces
         )
+        lost = other.gain.after - best.gain.after
         alike = difference(simulator, other.fitted, best.fitted).t < ALIKE_T
         if (
             other.effect.name == "measurement_delay"
             and other.effect.axis == best.effect.axis
-            and alike
+            and (alike or lost < ALIKE_SHARE * (best.gain.before - best.gain.after))
         ):
             best = other
         elif contained and (

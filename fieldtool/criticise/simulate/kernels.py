@@ -236,21 +236,19 @@ def march_bent(
 def slider(
     position: FloatArray, forward: FloatArray, backward: FloatArray, reach: float
 ) -> FloatArray:
-    """Return the force of a spring in series with a dry slider (Jenkins element), (n,).
+    """Return the force of dry friction that builds up over a distance after each turn, (n,).
 
-    It yields at ``forward`` (n,) moving up and at -``backward`` (n,) moving down; between, it changes by
-    the mean of both over ``reach`` per distance.
+    It nears ``forward`` (n,) moving up and -``backward`` (n,) moving down, and what it lacks falls to
+    1/e within ``reach``.
+    Source: Dahl, AIAA Journal 14, 1976, p. 1675 (exponent 1).
     """
     out = np.empty(position.size)
     force = 0.0
     for k in range(position.size):
         if k > 0:
-            stiffness = (abs(forward[k]) + abs(backward[k])) / (2.0 * reach)
-            force += stiffness * (position[k] - position[k - 1])
-        up, down = max(forward[k], 0.0), -max(backward[k], 0.0)
-        if force > up:
-            force = up
-        elif force < down:
-            force = down
+            moved = position[k] - position[k - 1]
+            goal = forward[k] if moved > 0.0 else -backward[k]
+            if moved != 0.0:
+                force = goal + (force - goal) * np.exp(-abs(moved) / reach)
         out[k] = force
     return out
