@@ -23,6 +23,8 @@ from bench_demo import CLASSIC, on_the_bus, rows
 from scipy.stats import f
 
 from drives.profile import load_machine
+from fieldtool.identify.likelihood.parameters import machine_parameters, parameter_values
+from fieldtool.identify.recorded import Identified
 from fieldtool.records.model import MachineModel
 from fieldtool.workflow import Options, identify, measure
 from fieldtool.workflow.models import truth_model
@@ -55,6 +57,7 @@ def main() -> None:
     stds: dict[str, dict[str, list[float]]] = {}
     kinds: dict[str, str] = {}
     machine_times: dict[str, list[float]] = {way: [] for way in ways}
+    together: dict[str, list[tuple[float, int]]] = {}
     print(f"{arguments.machine}, seeds {seeds}")
     print(
         f"{'way':<12}{'seed':>12}{'machine s':>11}{'wall s':>9}{'largest error over standard error':>36}"
@@ -67,9 +70,10 @@ def main() -> None:
         for seed in others or seeds:
             keep = arguments.keep if way == "classic" else None
             begin = time.perf_counter()
-            model, machine_time = _session(arguments.machine, seed, options, keep)
-            found = list(rows(model, truth))
+            identified, machine_time = _session(arguments.machine, seed, options, keep)
+            found = list(rows(identified.model, truth))
             machine_times[way].append(machine_time)
+            together.setdefault(way, []).append(_together(identified, truth))
             for kind, name, _, error, sigmas in found:
                 errors.setdefault(name, {}).setdefault(way, []).append(error)
                 stds.setdefault(name, {}).setdefault(way, []).append(abs(error / sigmas))
@@ -83,11 +87,12 @@ def main() -> None:
     _show(errors, kinds, list(ways))
     if "classic" in ways:
         _compare(errors, stds, machine_times)
+    _honesty(errors, stds, together)
 
 
 def _session(
     machine: str, seed: int, options: Options, keep: Path | None
-) -> tuple[MachineModel, float]:
+) -> tuple[Identified, float]:
     """Measure and identify; a session that was kept is identified again."""
     with tempfile.TemporaryDirectory() as temporary:
         folder = (keep or Path(temporary)) / f"{machine}-{seed}"
@@ -96,7 +101,22 @@ def _session(
             with on_the_bus(machine, seed) as profile:
                 seconds = measure(profile, folder, options)
             done.write_text(f"{seconds}", encoding="utf-8")
-        return identify(folder, options).model, float(done.read_text(encoding="utf-8"))
+        return identify(folder, options), float(done.read_text(encoding="utf-8"))
+
+
+def _together(identified: Identified, truth: MachineModel) -> tuple[float, int]:
+    """Square of all errors together, by their covariance, and how many there are."""
+    fitted = identified.fitted
+    if fitted is None:
+        return np.nan, 0
+    listed = machine_parameters(truth, np.array([1.0, 100.0]))
+    values = parameter_values(truth, listed, [0.0] * len(truth.axes))
+    true = {p.name: v for p, v in zip(listed, values, strict=True) if p.kind in LIMITS}
+    place = [k for k, name in enumerate(fitted.names) if name in true]
+    error = np.array([fitted.values[k] - true[fitted.names[k]] for k in place])
+    std = np.sqrt(np.diag(fitted.covariance))[place]
+    correlation = fitted.covariance[np.ix_(place, place)] / np.outer(std, std)
+    return float(error / std @ np.linalg.solve(correlation, error / std)), len(place)
 
 
 def _show(
@@ -139,16 +159,33 @@ def _compare(
                 worse = sum(r < low for r in ratios.values())
                 text += f", {better} proven better and {worse} proven worse (95 %)"
             print(text)
+
+
+def _honesty(
+    errors: dict[str, dict[str, list[float]]],
+    stds: dict[str, dict[str, list[float]]],
+    together: dict[str, list[tuple[float, int]]],
+) -> None:
+    """Errors over what is stated of them, each alone, and together with their correlations."""
     print(
-        "errors over stated standard errors, root mean square of all (1: honest), and 95 % intervals:"
+        "\nerrors over stated standard errors, root mean square (1: honest).  The errors of a session "
+        "go together;\nby their covariance they are as many independent numbers, whose scatter is known"
     )
-    for way in machine_times:
+    for way, both in together.items():
         shares = np.array([np.divide(errors[n][way], stds[n][way]) for n in errors])
         held = 100 * np.mean(np.abs(shares) <= 1.96)
         by_seed = np.sqrt(np.mean(shares**2, axis=0))
+        squares, counts = np.array(both).T
+        count = float(counts.sum())
         print(
             f"  {way:<12}{_rms(list(np.ravel(shares))):6.2f}  ({by_seed.min():.2f} to "
-            f"{by_seed.max():.2f} by seed), hold {held:.1f} %"
+            f"{by_seed.max():.2f} by seed), 95 % intervals hold {held:.1f} %"
+            + (
+                f"; by covariance {np.sqrt(squares.sum() / count):.2f} +- "
+                f"{1.96 / np.sqrt(2 * count):.2f} (95 %)"
+                if count
+                else ""
+            )
         )
 
 
