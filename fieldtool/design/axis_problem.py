@@ -40,7 +40,7 @@ STEEP = 30.0
 UNSTABLE = 1e3
 STIFFNESS = 0.025
 """Cost of the logarithm of what a disturbance leaves, in durations of the move."""
-INNER_BAND = 0.7
+INNER_BAND = 0.6
 """Of the band: where the search wants an axis to be, so that it is in the band for sure."""
 MOVED, PUSHED = 2.0, 0.3
 """Weights of the axis' move and of a disturbance."""
@@ -53,7 +53,7 @@ FAR_GAIN = 0.5
 be three times what the model says without making the loop unstable."""
 
 
-FED_NOISE = 2.0
+FED_NOISE = 3.0
 """RMS of the torque that rounded targets make by inertia feed-forward, over that allowed of the
 encoder's steps."""
 
