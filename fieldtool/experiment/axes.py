@@ -80,6 +80,15 @@ def bring_to_centre(motion: Motion, axes: Axes) -> None:
     way = np.empty((n, len(paths)))
     for k, path in enumerate(paths):
         way[:, k] = start[k] + np.concatenate([path, np.full(n - path.size, path[-1])])
+    _follow_until_still(motion, axes, way)
+
+
+def come_to_rest(motion: Motion, axes: Axes, targets: FloatArray) -> None:
+    """Hold every axis at its target, shape (M,), until nothing swings: what coasts would go on."""
+    _follow_until_still(motion, axes, targets[None, :])
+
+
+def _follow_until_still(motion: Motion, axes: Axes, way: FloatArray) -> None:
     hold = np.tile(way[-1], (max(2, round(STILL_TIME / motion.cycle_time)), 1))
     travel = np.array([limits.travel[1] - limits.travel[0] for limits in axes.limits])
     held = 0

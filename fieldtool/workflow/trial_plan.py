@@ -28,14 +28,14 @@ ROOM = 0.6
 """Of the way to the end of the travel that a move may use: it may overshoot."""
 FEWEST_COUNTS, BAND_COUNTS = 100.0, 4.0
 """Counts of the encoder that a move, and the band about its target, have at least."""
-KEPT = 0.7
+KEPT = 0.85
 """Of the limits of torque, velocity and following error that a move may take by prediction."""
 GENTLER, TIMES = 0.75, 12
 """What is left of a move's velocity and acceleration where it takes more, and how often."""
 SWELLS, BESIDE = 1.6, 0.15
 """Times the predicted torque, and share of the limit besides, that a move may take; never more than
 MOST of the limit, and OTHERS of it on axes that are not moved."""
-MOST, OTHERS = 0.9, 0.5
+MOST, OTHERS = 0.97, 0.95
 EXCITED = 3.0
 """Times what the excitation does by the model that it may do."""
 REST, LEAST_REST, MOST_REST = 2.0, 0.5, 6.0

@@ -244,14 +244,17 @@ class Verification:
             trusts_loops=trusts_loops,
             louder=louder,
             report=self._session.screen.progress,
-            exciting=self._group.without_feed_forward if self._by_reference else nullcontext,
+            exciting=self._ready_to_excite,
         )
 
-    @property
-    def _by_reference(self) -> bool:
-        """Whether position references excite: then feed-forward would take most of the limits."""
+    @contextmanager
+    def _ready_to_excite(self) -> Iterator[None]:
+        """Wait for standstill; where references excite, feed-forward would take most of the limits."""
         lines = self._planned.lines
-        return lines is not None and not np.all(lines.by_torque)
+        by_reference = lines is not None and not np.all(lines.by_torque)
+        wait_for_standstill(self._group)
+        with self._group.without_feed_forward() if by_reference else nullcontext():
+            yield
 
     def _louder(self, servos: Sequence[Servo]) -> FloatArray:
         """Return times the usual level by which torques may swing at rest: what encoders' steps do."""

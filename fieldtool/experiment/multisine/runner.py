@@ -12,7 +12,14 @@ from dataclasses import dataclass, replace
 from drives.api import Capture, FloatArray, Motion
 from drives.errors import SafetyStopError, StoppedError
 from fieldtool.errors import LoopUnstableError
-from fieldtool.experiment.axes import Axes, Keep, Mover, bring_to_centre, keep_whatever_happens
+from fieldtool.experiment.axes import (
+    Axes,
+    Keep,
+    Mover,
+    bring_to_centre,
+    come_to_rest,
+    keep_whatever_happens,
+)
 from fieldtool.experiment.multisine.plan import MultisinePlan, streams
 from fieldtool.experiment.multisine.stream import ExperimentStream, Job
 from fieldtool.records.recording import Experiment
@@ -101,6 +108,8 @@ def run_multisine(
                 stream = ExperimentStream(row, axes, jobs[len(row) :], teller.tell)
                 _follow(motion, stream, axes, finished)
                 jobs, verdict = stream.left, stream.verdict
+            if verdict is None and finished and finished[-1][1].rows:
+                come_to_rest(motion, axes, finished[-1][1].position_reference[-1])
         if verdict is not None:
             raise verdict
     except BaseException as error:

@@ -35,6 +35,9 @@ SWING_OF_ERROR, SWING_COUNTS = 0.02, 8.0
 peak to peak; at rest half of it."""
 GROWS = 1.2
 """A swing grows that is larger by this than one before it, in the same direction, of the same series."""
+LEAPS, FAST = 1.3, 3
+"""A swing that is larger by this than the one just before it, in the other direction, leaps, where both
+are so many times faster than they have to be."""
 FAR_ABOVE = 5.0
 """Times the level: swings of this size count whether they grow or not."""
 LONGEST_HALF = 0.25
@@ -124,6 +127,8 @@ class OscillationWatch:
     def begin(self) -> None:
         """Another motion begins: its axes stand still where they are first seen."""
         self._allowed, self._rest = None, []
+        for swings in (*self._torques, *self._positions):
+            swings.restart(float("inf"))
 
     def hold(self, at: FloatArray) -> None:
         """Allow no more than standing still at positions, shape (M,)."""
@@ -187,9 +192,9 @@ class OscillationWatch:
     def _allow(self, allowed: Allowed) -> None:
         self._allowed = allowed
         for torque, level in zip(self._torques, allowed.torque_swing.tolist(), strict=True):
-            torque.restart(level)
+            torque.go_on(level)
         for position, level in zip(self._positions, allowed.position_swing.tolist(), strict=True):
-            position.restart(level)
+            position.go_on(level)
 
     def take(self, position: Sequence[float], torque: Sequence[float]) -> Alarm | None:
         """Take one cycle; see ``drives.api.MotionWatch``."""
@@ -253,11 +258,19 @@ class OscillationWatch:
 
     def _oscillates(self, swings: Swings, allowed: Allowed) -> bool:
         """Whether the swings, of which one was completed just now, are an oscillation."""
-        if not swings.within(allowed.turns, int(allowed.half_period / self._step) + 1):
+        longest = int(allowed.half_period / self._step) + 1
+        if allowed.growing and self._leaps(swings.series(longest // FAST + 1)):
+            return True
+        if not swings.within(allowed.turns, longest):
             return False
         if not allowed.growing:
             return True
         if min(swings.sizes[-allowed.turns :]) > FAR_ABOVE * swings.level:
             return True
-        series = swings.series(int(allowed.half_period / self._step) + 1)
+        series = swings.series(longest)
         return series[-1] > GROWS * min(series[-3::-2])
+
+    @staticmethod
+    def _leaps(series: list[float]) -> bool:
+        """Whether fast swings grow so quickly that two of them are enough to tell."""
+        return len(series) > 1 and series[-1] > LEAPS * series[-2]

@@ -29,6 +29,13 @@ class Swings:
         self.level, self.sizes, self.times, self._rising = level, [], [], None
         self._low, self._high = float("inf"), float("-inf")
 
+    def go_on(self, level: float) -> None:
+        """Look for turns of another level from now on; those that were seen still count."""
+        if self.level < float("inf") and level < float("inf"):
+            self.level = level
+        else:
+            self.restart(level)
+
     def take(self, value: float) -> bool:
         """Take a sample; return whether it completes a swing."""
         self._now += 1

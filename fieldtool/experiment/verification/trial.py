@@ -13,7 +13,14 @@ import numpy as np
 
 from drives.api import Capture, FloatArray, Motion, MotionWatch
 from drives.errors import StoppedError
-from fieldtool.experiment.axes import Axes, Keep, Mover, keep_whatever_happens, sample_times
+from fieldtool.experiment.axes import (
+    Axes,
+    Keep,
+    Mover,
+    come_to_rest,
+    keep_whatever_happens,
+    sample_times,
+)
 from fieldtool.experiment.directions import (
     CHECK_ASTRAY,
     CHECK_ASTRAY_ERROR,
@@ -34,6 +41,8 @@ NUDGE_TORQUE = 0.3
 """Share of the torque limit that a nudge may take."""
 BEYOND, BEHIND = 0.5, 0.15
 """Shares of a move by which it may be overshot, and by which the axis may go the wrong way."""
+SHAKEN = 4.0
+"""Times what an axis may go at rest that it may be beside its way: the others' moves shake it."""
 PUSHED_ERROR = 0.3
 """Share of its following error limit by which an axis may be pushed that does not move itself."""
 SLICE_TIME = 0.02
@@ -78,7 +87,7 @@ class Trial:
     def duration(self) -> float:
         """Seconds, all of it."""
         rows = sum(2 * (move.reference.size + move.rest) for move in self.moves)
-        nudges = len(self.moves) * 3 * NUDGE_TIME
+        nudges = len(self.moves) * 4 * NUDGE_TIME
         excited = self.excitation.duration if self.excitation else 0.0
         return rows * self.cycle_time + nudges + 2 * HOLD_TIME + excited
 
@@ -201,6 +210,7 @@ def run_trial(
                 steps.nudge(move)
             for move in trial.moves:
                 steps.move(move)
+            come_to_rest(motion, axes, start)
         if trial.excitation is not None:
             there = replace(axes, centre=start)
             excited = _Excited(mover, watch, start, trial, still)
@@ -244,7 +254,7 @@ class _Steps:
         size = float(np.copysign(min(size, abs(move.distance)), move.distance))
         limits = axes.limits[k]
         there = smooth_move(size, limits.velocity, limits.acceleration, step, NUDGE_TIME)
-        pause = np.full(max(2, round(NUDGE_TIME / 2 / step)), 1.0)
+        pause = np.full(max(2, round(NUDGE_TIME / step)), 1.0)
         path = np.concatenate([there, size * pause, size - there, 0 * pause])
         torque = NUDGE_TORQUE * np.array([one.torque for one in axes.limits])
         self._allow(k, size, np.minimum(torque, move.torque), NUDGE_TIME / 3, gentle=True)
@@ -274,7 +284,7 @@ class _Steps:
         errors = np.array([one.following_error for one in self._axes.limits])
         slack = np.maximum(CHECK_PUSHED * self._still, PUSHED_ERROR * errors)
         low, high = self._start - slack, self._start + slack
-        slack_k = float(self._still[k])
+        slack_k = SHAKEN * float(self._still[k])
         before, after = (BEYOND, BEHIND) if back else (BEHIND, BEYOND)
         ends = (-before * distance, (1 + after) * distance)
         low[k] = self._start[k] + min(ends) - slack_k
@@ -331,7 +341,7 @@ class _Excited:
         still: FloatArray,
     ) -> None:
         self._mover, self._watch, self._torque = mover, watch, trial.torque
-        self._low, self._high = start - trial.excursion - still, start + trial.excursion + still
+        self._start, self._room = start, trial.excursion + still
 
     @contextmanager
     def motion(
@@ -342,7 +352,11 @@ class _Excited:
         watch: MotionWatch | None = None,
     ) -> Iterator[Motion]:
         with self._mover.motion(cycle_time, free, torque_offset, watch) as motion:
-            self._watch.excite(self._low, self._high, self._torque)
+            ends = (
+                np.minimum(self._start, self._mover.held),
+                np.maximum(self._start, self._mover.held),
+            )
+            self._watch.excite(ends[0] - self._room, ends[1] + self._room, self._torque)
             yield motion
 
 
