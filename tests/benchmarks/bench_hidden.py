@@ -274,7 +274,7 @@ def main():
             line = case_of(kind, already + k, seed + 7919 * (already + k), effect)
             have.append(line)
             with file.open("a") as out:
-                out.write(json.dumps(line) + "\n")
+                out.write(json.dumps(line, default=float) + "\n")
             hidden = ", ".join(f"{h['effect']} {h['size']}" for h in line.get("hidden", []))
             named = [n if isinstance(n, list) else [n["effect"], n["axis"]] for n in line["named"]]
             mark = "" if line.get("first", True) else "  tie" if line["tie"] else "  WRONG"

@@ -101,6 +101,13 @@ def _phase(rng: np.random.Generator) -> float:
     return float(rng.uniform(0, 2 * pi))
 
 
+def _between_lines(rng: np.random.Generator) -> float:
+    """Hz, off multiples of the period's frequency: there nobody can tell it from the excitation."""
+    return float(
+        (rng.integers(3.0 * MULTISINE, 40.0 * MULTISINE) + rng.uniform(0.3, 0.7)) / MULTISINE
+    )
+
+
 def _other(machine: Machine, axis: int) -> tuple[int, int]:
     return (axis, 1 - axis)
 
@@ -129,7 +136,7 @@ MAKERS: Mapping[str, Maker] = {
     "gravity": lambda m, a, s, r: Gravity(0.2 * s * m.peak[a], float(r.uniform(-1.5, 1.5))),
     "cogging": lambda m, a, s, r: Cogging(0.1 * s * m.peak[a], _periods(r), _phase(r)),
     "periodic_disturbance": lambda m, a, s, r: PeriodicDisturbance(
-        0.1 * s * m.peak[a], float(r.uniform(3.0, 40.0)), _phase(r)
+        0.1 * s * m.peak[a], _between_lines(r), _phase(r)
     ),
     "extra_mode": lambda m, a, s, r: ExtraMode(
         0.3 * s * _total(m, a), float(r.uniform(5.0, 40.0)), float(r.uniform(0.01, 0.05))

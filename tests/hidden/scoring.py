@@ -39,7 +39,7 @@ class Number:
         error = abs(self.value - self.truth)
         if error <= CLOSE * abs(self.truth):
             return True
-        return isfinite(self.std) and error <= INTERVAL * self.std
+        return bool(isfinite(self.std) and error <= INTERVAL * self.std)
 
 
 def is_of(hidden: Hidden, effect: str, axis: str | tuple[str, str]) -> bool:

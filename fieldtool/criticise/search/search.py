@@ -227,6 +227,8 @@ def _round(
             signed.append(candidate)
     if signed:
         return [_winner(prepared, signed, rejected)], looked
+    if accepted:
+        return [], looked  # what pairs alone explain is looked for once, before anything has a name
     return _pair(prepared, context, current, accepted, at, chosen[:PAIRED], unseen), looked
 
 
