@@ -353,7 +353,7 @@ ROWS: tuple[Row, ...] = (
         refused("arm: node 12 answers more often than it is asked: two drives have this node id"),
         stopped("arm: (PDOs of node 12 come|its position jumped|the drive left)", cycles=5),
         stopped("arm: (PDOs of node 12 come|its position jumped|the drive left)", cycles=5),
-        mixed("arm, object 0x1010:01: .*two drives have this node id.*0x1000:00: .*two answers"),
+        mixed(r"arm, object 0x\w+:0\d: .*two drives have this node id.*0x1000:00: .*two answers"),
     ),
     _stranger("SYNC", lambda n: Stranger(n, 0x80), "a SYNC"),
     _stranger(
