@@ -45,8 +45,8 @@ NOISE_SWINGS = 12.0
 ROUNDED_TARGETS = 4.0
 """Targets are whole counts: their second difference, a cycle squared apart, may swing by so many counts,
 peak to peak, and the inertia that is fed forward makes torque of it."""
-NOT_AS_SAID = 1.25
-"""Factor by which a peak of sensitivity may be off what the tuning says."""
+NOT_AS_SAID, FASTER_THAN_SAID = 1.25, 1.5
+"""Factors by which a peak of sensitivity, and a bandwidth, may be off what the tuning says."""
 STANDSTILL_TIME, STANDSTILL_TIMEOUT = 0.25, 120.0
 STANDSTILL_COUNTS, STANDSTILL_TRAVEL = 3.0, 2e-5
 """A disabled axis stands that moves by less than so many counts, or this share of its travel, in so many
@@ -127,6 +127,7 @@ def plan_trial(
     changes: Sequence[Change],
     bound: float,
     stated: Mapping[str, float],
+    designed: Prediction | None = None,
 ) -> TrialPlan:
     """Plan moves and excitation from where the axes stand, for the old and the new parameters.
 
@@ -142,6 +143,8 @@ def plan_trial(
         Of the peak of sensitivity that the new parameters were designed for.
     stated
         What that peak is by the tuning, by axis; empty where the model is not the one it was made for.
+    designed
+        What the tuning predicts, where it does.
 
     Raises
     ------
@@ -156,7 +159,7 @@ def plan_trial(
     for _ in range(TIMES):
         before, after = (predict(setting.model, servos, moves) for servos in (old, new))
         _check_stable(after, bound)
-        _check_as_designed(after, stated)
+        _check_as_designed(after, stated, designed)
         over = [_takes_too_much(setting, k, (before, after)) for k in range(len(moves))]
         if not any(over):
             break
@@ -226,15 +229,23 @@ def _free_move(drive: CanopenDrive, typical: TestMove) -> TestMove:
     return replace(typical, distance=sign * way, band=band)
 
 
-def _check_as_designed(after: Prediction, stated: Mapping[str, float]) -> None:
+def _check_as_designed(
+    after: Prediction, stated: Mapping[str, float], designed: Prediction | None
+) -> None:
     """Refuse parameters that are not what their tuning says of them: changed, or of another model."""
     for axis in after.axes:
         peak, said = axis.margins.sensitivity_peak, stated.get(axis.axis)
+        wrong = ""
         if said is not None and not 1 / NOT_AS_SAID < peak / said < NOT_AS_SAID:
+            wrong = f"the peak of sensitivity is {said:.3g}; now it would be {peak:.3g}"
+        elif said is not None and designed is not None:
+            bandwidth, promised = axis.margins.bandwidth, designed.of(axis.axis).margins.bandwidth
+            if not 1 / FASTER_THAN_SAID < bandwidth / promised < FASTER_THAN_SAID:
+                wrong = f"the bandwidth is {promised:.3g} Hz; now it would be {bandwidth:.3g} Hz"
+        if wrong:
             raise PlanRefusedError(
-                f"{axis.axis}: its tuning says that the peak of sensitivity is {said:.3g}; with these "
-                f"parameters it would be {peak:.3g} by the model. Either they were changed, or the "
-                "model was. Nothing was moved or written. Design anew (`fieldtool design`)."
+                f"{axis.axis}: its tuning says that {wrong}, by the model. Either they were changed, or "
+                "the model was. Nothing was moved or written. Design anew (`fieldtool design`)."
             )
 
 

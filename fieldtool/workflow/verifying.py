@@ -139,7 +139,7 @@ class Verification:
         self._stated = (
             {axis.axis: axis.sensitivity_peak for axis in tuning.axes} if believed else {}
         )
-        self._bound = tuning.bound
+        self._bound, self._tuning = tuning.bound, tuning
         self._setting = setting_of(session.machine, group, model)
         self._axes: Axes = axes_of(group, self._setting)
         self._plan: TrialPlan | None = None

@@ -357,7 +357,19 @@ class _Excited:
                 np.maximum(self._start, self._mover.held),
             )
             self._watch.excite(ends[0] - self._room, ends[1] + self._room, self._torque)
-            yield motion
+            u = np.arange(1, round(NUDGE_TIME / cycle_time) + 1) * cycle_time / NUDGE_TIME
+            rises = u**3 * (10 - 15 * u + 6 * u * u)
+            way = self._mover.held + np.outer(rises, self._start - self._mover.held)
+            motion.stream(_slices(way, cycle_time))
+            yield _Standing(motion, way[-1])
+
+
+class _Standing:
+    """A motion whose axes are taken to be where they were told to stand: from there on is no jolt."""
+
+    def __init__(self, motion: Motion, at: FloatArray) -> None:
+        self.cycle_time, self.position = motion.cycle_time, at
+        self.stream = motion.stream
 
 
 Turn = tuple[int, Callable[[], None]]
