@@ -41,9 +41,10 @@ class Separation:
     model: MachineModel
     cause: Fitted
     rivals: tuple[Fitted, ...]
+    rows: int
+    """Numbers that are compared."""
     misfit: float
-    """Sum of squares a number that the cause leaves at hand, at least 1: what is not noise "
-    "counts less."""
+    """Sum of squares a number that the cause leaves at hand, at least 1: more than noise counts less."""
 
     def expected(self, experiments: Sequence[Experiment]) -> float:
         """Return the least evidence against a rival that new experiments would bring.
@@ -83,6 +84,17 @@ class Separation:
             for cost, rival in zip(costs[1:], self.rivals, strict=True)
         ]
         return float(min(gained))
+
+    def measured(self) -> tuple[int, float]:
+        """Return which explains the data at hand best (0: the cause, then the rivals), and the evidence.
+
+        The evidence is what the next best's sum of squares is larger by, over what the best leaves; see
+        :data:`DECISIVE`.
+        """
+        costs = np.array([one.cost for one in (self.cause, *self.rivals)])
+        best = int(np.argmin(costs))
+        misfit = max(1.0, float(costs[best]) / max(self.rows, 1))
+        return best, float(np.delete(costs, best).min() - costs[best]) / misfit
 
     def _prepared(self, experiments: Sequence[Experiment]) -> Prepared:
         both = replace(self.recording, experiments=(*self.recording.experiments, *experiments))
@@ -128,7 +140,7 @@ def separation(
         tried.append(_with(prepared, current, _key(names, rival)))
     rows = prepared.simulator.residual(tried[0].hypothesis, "fit").size
     misfit = max(1.0, tried[0].cost / max(rows, 1))
-    return Separation(recording, model, tried[0], tuple(tried[1:]), misfit)
+    return Separation(recording, model, tried[0], tuple(tried[1:]), rows, misfit)
 
 
 def _started(prepared: Prepared) -> tuple[Prepared, Hypothesis]:

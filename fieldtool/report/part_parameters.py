@@ -32,8 +32,8 @@ def parameters(material: Material) -> Section | None:
     blocks.append(
         Words(
             tuple(
-                f"{axis.axis}: {axis.reason} Peak of sensitivity {axis.sensitivity_peak:.2f} (2 "
-                "or less is good)."
+                f"{axis.axis}: {axis.reason} Peak of sensitivity {axis.sensitivity_peak:.2f} ("
+                f"{material.tuning.bound:g} or less was asked for)."
                 for axis in material.tuning.axes
             ),
             "list",

@@ -10,7 +10,7 @@ import numpy as np
 from drives.canopen_drive import CanopenGroup
 from drives.profile import MachineProfile, load_machine
 from fieldtool.criticise.criticise import Criticised, criticise, starting_model
-from fieldtool.criticise.criticism import Cause, Criticism
+from fieldtool.criticise.criticism import Cause, Criticism, Rejected, Rival
 from fieldtool.criticise.criticism_file import read_criticism
 from fieldtool.criticise.separate import DECISIVE, Separation, separation
 from fieldtool.criticise.simulate.motion import white_noise
@@ -154,45 +154,42 @@ def distinguish(
         with backed_up(profile.name, group.drives, before), group.without_feed_forward():
             work = _Distinguishing(session, group, options, question)
             seconds = work.run()
-    found = _judged(session, question)
-    answer = _answer(question.cause, found.criticism)
+    found, answer = _judged(session, question)
     session.folder.note("answer", words=answer)
     session.screen.say(answer)
     report(session.folder.path)
     return Distinguished(out, question.words, answer, found.criticism, seconds)
 
 
-def _judged(session: Session, question: Question) -> Criticised:
-    """Put both recordings into the new folder, and criticise them together."""
+def _judged(session: Session, question: Question) -> tuple[Criticised, str]:
+    """Put both recordings into the new folder, weigh the rivals, criticise without those that lost."""
     session.screen.stage("Criticise with both recordings")
-    folder = session.folder
+    folder, cause = session.folder, question.cause
     new = load(folder.recording)
     earlier = tuple(replace(e, name=f"{EARLIER} {e.name}") for e in question.recording.experiments)
     both = replace(new, experiments=(*earlier, *new.experiments))
     save(both, folder.recording)
     write_model(question.model, folder.model)
-    found = criticise(both, question.model, question.prior, advance=session.screen.doing)
+    start = starting_model(question.model, question.prior)
+    apart = separation(both, start, question.criticism, cause, session.screen.doing)
+    best, evidence = apart.measured()
+    rivals: list[Cause | Rival] = [cause, *cause.ties]
+    lost = [r for k, r in enumerate(rivals) if k != best] if evidence >= DECISIVE else []
+    elsewhere = {c.effect for c in question.criticism.causes if c is not cause}
+    without = frozenset(r.effect for r in lost) - elsewhere - {rivals[best].effect}
+    found = criticise(both, question.model, question.prior, without, advance=session.screen.doing)
+    told = f"evidence {evidence:.3g}, {DECISIVE:g} decide"
+    why = f"was told apart by a measurement ({told})"
+    rejected = tuple(Rejected(r.effect, r.axis, r.location, why) for r in lost)
+    criticism = replace(found.criticism, rejected=(*rejected, *found.criticism.rejected))
+    found = replace(found, criticism=criticism)
     keep(folder, found, question.model)
-    return found
-
-
-def _answer(cause: Cause, now: Criticism) -> str:
-    """Say what became of a tie."""
-    rivals = {t.effect for t in cause.ties}
-    for one in now.causes:
-        if one.axis != cause.axis or one.effect not in {cause.effect, *rivals}:
-            continue
-        left = {t.effect for t in one.ties} & {cause.effect, *rivals}
-        if left:
-            return (
-                f"Not told apart: {one.effect} of {one.axis_words}, or {', '.join(sorted(left))}."
-            )
-        against = ", ".join(sorted({cause.effect, *rivals} - {one.effect}))
-        return f"Told apart: it is {one.effect} of {one.axis_words}, and not {against}."
-    return (
-        f"With both recordings neither {cause.effect} nor {', '.join(sorted(rivals))} explains "
-        f"what is left (verdict: {now.verdict})."
-    )
+    if lost:
+        names = ", ".join(r.effect for r in lost)
+        winner = f"{rivals[best].effect} of {cause.axis_words}"
+        return found, f"Told apart: it is {winner}, and not {names} ({told})."
+    every = " or ".join(r.effect for r in rivals)
+    return found, f"Not told apart: {every} of {cause.axis_words} ({told})."
 
 
 class _Distinguishing(FastMeasurement):

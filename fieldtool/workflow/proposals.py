@@ -69,8 +69,17 @@ def proposals(ground: Ground, pair: frozenset[str]) -> Iterator[Proposal]:
         with suppress(PlanRefusedError):
             found = make(ground)
             if found is not None:
-                forecast_multisine(found.plan, ground.setting)
-                yield found
+                plan = _twice(found.plan)
+                forecast_multisine(plan, ground.setting)
+                yield Proposal(found.words, plan)
+
+
+def _twice(plan: MultisinePlan) -> MultisinePlan:
+    """Repeat the experiments of a single axis: one of two alike is kept unseen by the judge."""
+    if plan.experiments[0].axes > 1:
+        return plan
+    again = tuple(replace(one, name=f"{one.name} again") for one in plan.experiments)
+    return replace(plan, experiments=(*plan.experiments, *again))
 
 
 def _sizes(ground: Ground) -> Proposal | None:

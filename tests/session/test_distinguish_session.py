@@ -13,8 +13,9 @@ from fieldtool.errors import PlanRefusedError
 from fieldtool.records.recording import load
 from tests.session.conftest import one_axis
 
-HIDDEN = {"measurement_delay": (0.00025, 0.03), "torque_lag": (0.0004, 0.05)}
+HIDDEN = {"measurement_delay": (0.0005, 0.05), "torque_lag": (0.0006, 0.05)}
 """Effect: time in s, and noise of the torque in N m that hides which of the two it is."""
+TRIES = 3
 
 
 def machine_with(folder, name, effect, seed, **limits):
@@ -44,10 +45,14 @@ def test_a_delay_and_a_lag_are_told_apart_by_higher_frequencies(make_bench, tmp_
     effect = list(HIDDEN)[fresh_rng.integers(2)]
     other = next(name for name in HIDDEN if name != effect)
     print("hidden", effect)
-    path = machine_with(tmp_path, "first", effect, int(fresh_rng.integers(1000)))
-    criticism = tied(path, tmp_path / "first")
-    (cause,) = criticism.causes
-    assert {cause.effect, *(t.effect for t in cause.ties)} == set(HIDDEN)
+    for attempt in range(TRIES):  # at this noise now and then a tie does not come about
+        earlier = tmp_path / f"first-{attempt}"
+        path = machine_with(tmp_path, "first", effect, int(fresh_rng.integers(1000)))
+        criticism = tied(path, earlier)
+        named = [{c.effect, *(t.effect for t in c.ties)} for c in criticism.causes]
+        if set(HIDDEN) in named:
+            break
+    assert named == [set(HIDDEN)]
     bench = make_bench()  # only for its command line
 
     # Limits that leave no room: one sentence, and nothing moves.
@@ -55,7 +60,7 @@ def test_a_delay_and_a_lag_are_told_apart_by_higher_frequencies(make_bench, tmp_
         tmp_path, "narrow", effect, 1, travel=["-1 deg", "1 deg"], torque="0.2 N m"
     )
     refused = bench.command(
-        "measure", narrow, "--to-distinguish", tmp_path / "first", "--yes", "--out", tmp_path / "no"
+        "measure", narrow, "--to-distinguish", earlier, "--yes", "--out", tmp_path / "no"
     )
     assert refused.code == 3
     assert "would tell them apart" in refused.err
@@ -63,12 +68,12 @@ def test_a_delay_and_a_lag_are_told_apart_by_higher_frequencies(make_bench, tmp_
     assert not (tmp_path / "no" / "recording.h5").exists()
 
     outcome = bench.command(
-        "measure", path, "--to-distinguish", tmp_path / "first", "--yes", "--json",
+        "measure", path, "--to-distinguish", earlier, "--yes", "--json",
         "--out", tmp_path / "second",
     )  # fmt: skip
     assert outcome.code == 0, outcome.err
     said = json.loads(outcome.out)
-    assert said["answer"] == f"Told apart: it is {effect} of table, and not {other}."
+    assert said["answer"].startswith(f"Told apart: it is {effect} of table, and not {other} (evi")
     (named,) = said["criticism"]["causes"]
     assert named["effect"] == effect
     assert named["ties"] == []
