@@ -38,12 +38,12 @@ DISTURBANCE = 0.2
 STEEP = 30.0
 """Cost of a bound that is missed, in durations of the move per relative excess."""
 UNSTABLE = 1e3
-STIFFNESS = 0.025
+STIFFNESS = 0.05
 """Cost of the logarithm of what a disturbance leaves, in durations of the move."""
 INNER_BAND = 0.6
 """Of the band: where the search wants an axis to be, so that it is in the band for sure."""
-MOVED, PUSHED = 2.0, 0.3
-"""Weights of the axis' move and of a disturbance."""
+MOVED = 2.0
+"""Weight of the axis' own move beside those of the others."""
 DURING = 0.05
 """Weight of the following error before the move has ended, for the feed-forward."""
 MOST_FED = np.array([1.0, 1.3])
@@ -53,6 +53,8 @@ FAR_GAIN = 0.5
 be three times what the model says without making the loop unstable."""
 
 
+SOFT = 0.01
+"""Weight of a compliance that is missed beside a margin: it is a wish."""
 FED_NOISE = 3.0
 """RMS of the torque that rounded targets make by inertia feed-forward, over that allowed of the
 encoder's steps."""
@@ -72,6 +74,8 @@ class Bounds:
     """Of the encoder, rad or m; NaN: not known."""
     top: float
     """rad/s: highest frequency that the model was measured at."""
+    compliance: float = np.inf
+    """Largest motor position per torque at the motor, rad/(N m) or m/N."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,6 +237,9 @@ class AxisProblem:
         for own, cross in zip(self._own, self._cross, strict=True):
             peak = max(peak, float(np.abs(own + cross * follow).max()))
         excess = peak / self.bounds.sensitivity - 1
+        if isfinite(self.bounds.compliance):
+            soft = float(np.abs(self._plant * inverse).max())
+            excess = max(excess, SOFT * (soft / self.bounds.compliance - 1))
         if self._far.any():
             far = np.abs(1 - inverse[self._far])
             excess = max(excess, float(far.max()) / FAR_GAIN - 1)
@@ -297,7 +304,6 @@ class AxisProblem:
         for plant, error in zip(self._plants, errors, strict=True):
             pushed = wave.signal(plant * disturbed)
             total += MOVED * _outside(error[self._begin :], band)
-            total += PUSHED * _outside(pushed, band)
             energy = float(pushed @ pushed) * self._tick / band**2
             total += STIFFNESS * self.move.duration / self._tick * float(np.log(energy + 1e-12))
         follow = gain * sensitivity

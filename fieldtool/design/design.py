@@ -17,9 +17,10 @@ import numpy as np
 
 from fieldtool.design.axis_problem import AxisProblem, Bounds, Grids, grids_of
 from fieldtool.design.drive_side import PID, DriveSide
-from fieldtool.design.loops import system_matrix
-from fieldtool.design.machine import Machine, machine_of
+from fieldtool.design.loops import Loops, system_matrix
+from fieldtool.design.machine import Machine, machine_of, respond
 from fieldtool.design.moves import TestMove, typical_move
+from fieldtool.design.predict import frequencies
 from fieldtool.design.robust import FRESH, MAY_FAIL, check, fresh_check, machines_for, stable_on_all
 from fieldtool.design.rule import DesignError, rule
 from fieldtool.design.search import Best, Space, again, search
@@ -57,6 +58,8 @@ class Task:
     rng: np.random.Generator
     advance: Advance
     found: list[Best] = field(default_factory=list)
+    softest: list[float] = field(default_factory=list)
+    """Compliance of each axis that new parameters should not exceed."""
 
     @property
     def servos(self) -> tuple[Servo, ...]:
@@ -67,7 +70,8 @@ class Task:
         """Return what one axis has to keep."""
         side = self.sides[axis]
         noise = NOISE_SHARE * side.torque_limit
-        return Bounds(bound, noise, side.torque_limit, side.resolution, self.top)
+        soft = self.softest[axis] if self.softest else inf
+        return Bounds(bound, noise, side.torque_limit, side.resolution, self.top, soft)
 
 
 def default_moves(model: MachineModel, sides: Sequence[DriveSide]) -> tuple[TestMove, ...]:
@@ -139,6 +143,8 @@ def _start(task: Task) -> None:
             corner = space.highest / (2 * np.pi)
         kept = servo.loop.filters  # of a drive whose filters can not be set
         servo = Servo(replace(fed, filters=kept), corner, side.timing)
+        if not kept:
+            servo = space.servo(space.vector(servo), servo)  # within what the drive holds
         task.found.append(Best(space, servo, inf))
     for _ in range(MOST_LOWERED):
         if stable_on_all(task.machines, task.servos):
@@ -154,6 +160,15 @@ def _start(task: Task) -> None:
     plain = len(known) == len(task.sides) and not any(now.loop.filters for now in known)
     if plain and np.all(check(task.machines, known).peaks <= task.bound):
         _take_better(task, known)
+    base = known if len(known) == len(task.sides) and stable_on_all(task.machines, known) else None
+    task.softest = _compliances(task.machines[0], base or task.servos)
+
+
+def _compliances(machine: Machine, servos: tuple[Servo, ...]) -> list[float]:
+    """Return the largest motor position per torque of each axis."""
+    values = np.linalg.eigvals(system_matrix(machine, servos)).astype(np.complex128)
+    closed = Loops(respond(machine, frequencies(machine, values)), servos).compliance
+    return [float(np.abs(closed[:, k, k]).max()) for k in range(len(servos))]
 
 
 def _take_better(task: Task, present: tuple[Servo, ...]) -> None:

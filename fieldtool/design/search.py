@@ -13,7 +13,7 @@ from fieldtool.records.closed_loop import AxisLoop, Biquad
 from fieldtool.records.model import FloatArray
 
 NOTCH, LOW_PASS = "notch", "low-pass"
-INTEGRAL = (0.01, 2.0)
+INTEGRAL = (0.12, 2.0)
 """velocity_i over velocity_p position_p."""
 DEPTH, POLE_DAMPING = (0.03, 1.0), (0.3, 2.0)
 """Of a notch: damping of the zeros over that of the poles; and that of the poles."""

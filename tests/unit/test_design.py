@@ -174,10 +174,14 @@ def test_a_pid_drive_gets_the_cascade_that_its_numbers_are(random_model: RandomM
 
 
 def test_uncertainty_that_allows_no_margin_is_said(random_model: RandomModel) -> None:
-    """Springs known to a factor of three, and a bound that is hardly above 1."""
+    """Masses and springs known to a factor of ten, and a bound that is hardly above 1."""
     model = random_model(np.random.default_rng(5), (2, 2))
     axes = tuple(
-        replace(a, springs=tuple(Estimate(e.value, 1.1 * e.value) for e in a.springs))
+        replace(
+            a,
+            masses=tuple(Estimate(e.value, 0.9 * e.value) for e in a.masses),
+            springs=tuple(Estimate(e.value, 0.9 * e.value) for e in a.springs),
+        )
         for a in model.axes
     )
     with pytest.raises(
