@@ -46,7 +46,7 @@ class CanopenGroup:
         stop_requested: Callable[[], bool],
     ) -> None:
         self.line, self.machine = line, machine
-        self._drives, self._stop_requested = tuple(drives), stop_requested
+        self._drives, self.stop_requested = tuple(drives), stop_requested
         self.warnings: list[str] = []
         """What could not be put back, in words."""
         self.onlooker: Onlooker | None = None
@@ -188,7 +188,7 @@ class CanopenGroup:
                 self._drives,
                 cycle_time,
                 floating,
-                self._stop_requested,
+                self.stop_requested,
                 offsets,
                 sync,
                 watch,

@@ -3,7 +3,13 @@
 from collections.abc import Callable, Iterable
 
 from drives.canopen_drive.interrupts import uninterrupted
-from drives.errors import DrivesError, StoppedError, WriteBackError, WriteBackMixedError
+from drives.errors import (
+    DrivesError,
+    StoppedError,
+    UserStopError,
+    WriteBackError,
+    WriteBackMixedError,
+)
 from drives.parameters.access import take_over, unlock
 from drives.parameters.backup import Backup
 from drives.parameters.bring_back import BroughtBack, Found, SilentDriveError, bring_back
@@ -54,6 +60,8 @@ class Transaction:
     prove
         Called once all drives hold the new values and have been read back, before one of them stores:
         what it raises takes the write back.  The journal is open meanwhile.
+    stop_requested
+        Asked before each drive stores and before the write ends: a stop takes the write back.
     """
 
     def __init__(
@@ -64,8 +72,9 @@ class Transaction:
         save: Save,
         tell: Tell = lambda _: None,
         prove: Prove | None = None,
+        stop_requested: Callable[[], bool] = lambda: False,
     ) -> None:
-        self._tell, self._prove = tell, prove
+        self._tell, self._prove, self._stop_requested = tell, prove, stop_requested
         self._drives = {drive.axis: drive for drive in drives}
         self._backups = {part.axis: part for part in backup.drives}
         self._save = save
@@ -91,6 +100,8 @@ class Transaction:
             their old values.
         WriteBackMixedError
             If the old values could not be brought back either; says which drive holds what.
+        UserStopError
+            If the user stopped: all drives hold their old values, unless the write had just ended.
         """
         try:
             self._save(self.journal)
@@ -98,7 +109,9 @@ class Transaction:
             while (step := next_step(self.journal)) is not None:
                 if step.action in (Action.STORE, Action.FINISH):
                     self._prove_once()
+                    self._heed_stop()
                 self._step_forward(step)
+            self._heed_stop()
         except BaseException as error:
             if self.journal.is_open:
                 self._take_back(error)
@@ -112,6 +125,11 @@ class Transaction:
             prove()
             for drive in self._drives.values():
                 self._check(drive)
+
+    def _heed_stop(self) -> None:
+        """End the write if the user asked for it: a trial that has just ended no longer asks."""
+        if self._stop_requested():
+            raise UserStopError("stopped by the user; no axis was moving, all are disabled.")
 
     def _step_forward(self, step: Step) -> None:
         self._tell(step)

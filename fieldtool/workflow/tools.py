@@ -130,6 +130,7 @@ def switch_tool(
             confirm,
             store,
             session.screen.say,
+            stop_requested=stop_requested,
         )
         session.folder.note("parameters", rows=parameter_table(result))
         session.folder.note("tool", name=name, written=result.in_memory, stored=result.stored)

@@ -209,6 +209,8 @@ class Verification:
             with self._recording() as keep:
                 tried = self._run("after", keep, trusts_loops=False)
             reasons = self._judge(tried)
+            if self._group.stop_requested():
+                raise UserStopError("stopped by the user; no axis was moving, all are disabled.")
         except UserStopError:
             reasons = ("the user stopped the trial",)
             raise

@@ -92,6 +92,7 @@ def written(
         options.store,
         session.screen.say,
         verification.prove if verification else None,
+        group.stop_requested,
     )
     session.folder.note("parameters", rows=parameter_table(result))
     session.folder.note("write", written=result.in_memory, stored=result.stored)

@@ -88,6 +88,7 @@ def apply(
     keep: bool = False,
     say: Callable[[str], None] = lambda _: None,
     prove: Callable[[], None] | None = None,
+    stop_requested: Callable[[], bool] = lambda: False,
 ) -> WriteBack:
     """Back up, show, ask, write, read back, and store if wanted: all drives or none.
 
@@ -112,6 +113,8 @@ def apply(
     prove
         Tries the new parameters once all drives hold them in working memory; what it raises
         (``drives.errors.NotVerifiedError``) takes the write back.  Nothing is stored before.
+    stop_requested
+        Asked before each drive stores and before the write ends.
 
     Raises
     ------
@@ -126,10 +129,14 @@ def apply(
         all drives hold their old values.
     WriteBackMixedError
         If not all of them could be brought back; says which drive holds what.
+    UserStopError
+        If the user stopped: all drives hold their old values.
     """
     refuse_unfinished(machine, drives, backup_path.parent)
     changes = changes_for(drives, tuning)
-    return apply_changes(machine, drives, changes, backup_path, confirm, keep, say, prove)
+    return apply_changes(
+        machine, drives, changes, backup_path, confirm, keep, say, prove, stop_requested
+    )
 
 
 def apply_changes(
@@ -141,6 +148,7 @@ def apply_changes(
     keep: bool = False,
     say: Callable[[str], None] = lambda _: None,
     prove: Callable[[], None] | None = None,
+    stop_requested: Callable[[], bool] = lambda: False,
 ) -> WriteBack:
     """Do the same as :func:`apply` with changes that are known already, in the order of writing."""
     refuse_unfinished(machine, drives, backup_path.parent)
@@ -155,7 +163,9 @@ def apply_changes(
     journal = planned_journal(machine, drives, changes, backup_path.name, storing)
     keeper = JournalKeeper(backup_path.with_name(JOURNAL))
     backup = load_backup(backup_path)
-    transaction = Transaction(drives, journal, backup, keeper, tell_storing(drives, say), prove)
+    transaction = Transaction(
+        drives, journal, backup, keeper, tell_storing(drives, say), prove, stop_requested
+    )
     try:
         with keeper:
             transaction.write()

@@ -1,6 +1,7 @@
 """New parameters through the bus: tried on the machine, kept or taken back, and told."""
 
 import json
+import signal
 
 import numpy as np
 import pytest
@@ -276,3 +277,36 @@ def test_a_whole_run_has_the_verification_in_its_json(small_bench):
     found = json.loads(outcome.out)["verification"]
     assert found["verdict"] == "verified"
     assert found["axes"][0]["after"]["sensitivity_peak"] < 2.1
+
+
+@pytest.mark.parametrize("moment", ["judging", "after the last trial", "storing the second drive"])
+def test_ctrl_c_after_the_last_motion_stores_nothing(session, monkeypatch, moment):
+    """No cycle asks for a stop any more: the work in hand has to."""
+    from drives.parameters.transaction import Transaction
+    from fieldtool.workflow.verifying import Verification
+
+    where, name = {
+        "judging": (Verification, "_judge"),
+        "after the last trial": (Verification, "_conclude"),
+        "storing the second drive": (Transaction, "_store"),
+    }[moment]
+    happens, calls = getattr(where, name), []
+
+    def pressed(*arguments):
+        calls.append(arguments)
+        if name != "_store" or len(calls) == 2:
+            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(signal.SIGINT)  # who is afraid presses again
+        return happens(*arguments)
+
+    monkeypatch.setattr(where, name, pressed)
+    outcome = write(session, "--store")
+    assert calls
+    assert outcome.code == 130, outcome.err
+    assert "All drives hold the old values" in outcome.err
+    assert session.changed() == {}
+    for node in session.machine.nodes:
+        node.power_cycle()
+    assert session.changed() == {}, "nothing new was left in non-volatile memory"
+    if moment == "judging":
+        assert verification(session)["verdict"] == "restored"
