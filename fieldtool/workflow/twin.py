@@ -187,10 +187,11 @@ def _chain(chain: AxisModel, parts: Rebuilt, left_out: list[str]) -> dict[str, A
     springs = [s.value * parts.springs.get((name, k), 1.0) for k, s in enumerate(chain.springs)]
     dampers = [e.value for e in chain.dampers] or [0.0] * len(springs)
     viscous = chain.viscous_friction.value + parts.viscous.get(name, 0.0)
-    if len(chain.masses) == 1:
-        viscous += chain.load_friction.value
-    elif chain.load_friction.value:
-        left_out.append(f"{name}: viscous friction at the load has no simulated part.")
+    viscous += chain.load_friction.value
+    if len(chain.masses) > 1 and chain.load_friction.value:
+        left_out.append(
+            f"{name}: viscous friction at the load has no simulated part; it is put at the motor."
+        )
     for what, values in (("damper", dampers), ("viscous friction", [viscous])):
         if min(values, default=0.0) < 0:
             left_out.append(
