@@ -42,7 +42,7 @@ REST, LEAST_REST, MOST_REST = 2.0, 0.5, 6.0
 """Times the predicted settling for which a move is watched after its end; at least, at most, s."""
 NOISE_SWINGS = 12.0
 """Times the RMS of the torque that an encoder's steps make: by so much it may swing, peak to peak."""
-ROUNDED_TARGETS = 4.0
+ROUNDED_TARGETS = 3.5
 """Targets are whole counts: their second difference, a cycle squared apart, may swing by so many counts,
 peak to peak, and the inertia that is fed forward makes torque of it."""
 NOT_AS_SAID, FASTER_THAN_SAID = 1.25, 1.5
@@ -108,7 +108,12 @@ def torque_steps(drive: CanopenDrive, servo: Servo, cycle_time: float) -> float:
     """Return how far the steps of encoder and targets alone may make a torque swing, peak to peak."""
     step = abs(drive.scaling.position)
     rounded = ROUNDED_TARGETS * servo.loop.inertia_ff * step / cycle_time**2
-    return NOISE_SWINGS * servo.torque_noise(step) + rounded
+    return encoder_swing(drive, servo) + rounded
+
+
+def encoder_swing(drive: CanopenDrive, servo: Servo) -> float:
+    """Return how far the steps of the encoder may make a torque swing at rest, peak to peak."""
+    return NOISE_SWINGS * servo.torque_noise(abs(drive.scaling.position))
 
 
 def _values(drive: CanopenDrive, changes: Sequence[Change]) -> Mapping[str, float]:

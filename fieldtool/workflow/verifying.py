@@ -41,6 +41,7 @@ from fieldtool.workflow.preparation import axes_of, recording_header, setting_of
 from fieldtool.workflow.session import Session
 from fieldtool.workflow.trial_plan import (
     TrialPlan,
+    encoder_swing,
     plan_trial,
     torque_steps,
     wait_for_standstill,
@@ -235,7 +236,9 @@ class Verification:
         return self._plan
 
     def _run(self, name: str, keep: Callable[[Experiment], None], *, trusts_loops: bool) -> Tried:
-        louder = self._louder(self._planned.old if name == "before" else self._planned.new)
+        servos = self._planned.old if name == "before" else self._planned.new
+        cycle = self._planned.trial.cycle_time
+        pairs = zip(self._group.drives, servos, strict=True)
         wait_for_standstill(self._group)
         return run_trial(
             self._group,
@@ -244,7 +247,8 @@ class Verification:
             keep,
             name,
             trusts_loops=trusts_loops,
-            louder=louder,
+            louder=self._louder(servos),
+            steps=np.array([torque_steps(drive, servo, cycle) for drive, servo in pairs]),
             report=self._session.screen.progress,
             exciting=self._ready_to_excite,
         )
@@ -261,13 +265,8 @@ class Verification:
     def _louder(self, servos: Sequence[Servo]) -> FloatArray:
         """Return times the usual level by which torques may swing at rest: what encoders' steps do."""
         limits = np.array([one.torque for one in self._axes.limits])
-        cycle = self._planned.trial.cycle_time
-        swings = np.array(
-            [
-                torque_steps(drive, servo, cycle)
-                for drive, servo in zip(self._group.drives, servos, strict=True)
-            ]
-        )
+        pairs = zip(self._group.drives, servos, strict=True)
+        swings = np.array([encoder_swing(drive, servo) for drive, servo in pairs])
         if self._old is not None:
             swings = np.maximum(swings, LOUDER * self._old.noise)
         louder: FloatArray = np.clip(swings / (HOLD_LEVEL * limits), 1.0, LOUDEST)

@@ -117,11 +117,15 @@ class Heard:
 def objects(running: RunningMachine) -> dict[tuple[int, int, int], Any]:
     """Every object of every node that a motion does not change by what it is."""
     return {
-        (node.node_id, *key): node.dictionary.read(*key)
+        (node.node_id, *key): _on_the_wire(node.dictionary.read(*key))
         for node in running.nodes
         for key, entry in ENTRIES.items()
         if entry.access != "wo" and key not in PROCESS_VALUES
     }
+
+
+def _on_the_wire(value: Any) -> Any:
+    return float(np.float32(value)) if isinstance(value, float) else value
 
 
 def planted(seed: int, number: int, disaster: str) -> dict[str, Any]:

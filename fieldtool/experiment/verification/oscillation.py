@@ -40,6 +40,8 @@ LEAPS, FAST = 1.3, 3
 are so many times faster than they have to be."""
 FAR_ABOVE = 5.0
 """Times the level: swings of this size count whether they grow or not."""
+MOST_STEPS = 0.6
+"""Share of the torque limit by which steps of the targets may make a torque swing, at most."""
 LONGEST_HALF = 0.25
 """Seconds from one turn to the next, at most."""
 TORQUE_UNITS = {"rad": "N m", "m": "N"}
@@ -89,6 +91,8 @@ class OscillationWatch:
     louder
         Times the usual level by which torques may swing at rest, shape (M,): 1 but for axes that were
         heard to be louder with loops that are known to be good.
+    steps
+        By how much torques may swing because targets that move are whole counts, peak to peak, (M,).
     units
         Of positions, one an axis, for messages.
     """
@@ -103,6 +107,7 @@ class OscillationWatch:
         *,
         trusts_loops: bool,
         louder: FloatArray | None = None,
+        steps: FloatArray | None = None,
         units: Sequence[str] = (),
     ) -> None:
         self._names, self._step, self._still = tuple(names), step, still
@@ -111,6 +116,7 @@ class OscillationWatch:
         errors = np.array([one.following_error for one in limits])
         self._position_swing = SWING_OF_ERROR * errors + SWING_COUNTS * counts
         self._louder = np.ones(len(self._names)) if louder is None else louder
+        self._steps = np.zeros(len(self._names)) if steps is None else steps
         self._trusts_loops = trusts_loops
         self._torques = [Swings() for _ in self._names]
         self._positions = [Swings() for _ in self._names]
@@ -160,6 +166,7 @@ class OscillationWatch:
         """
         share = HOLD_LEVEL if gentle else MOVE_LEVEL
         level = np.maximum(self._louder * HOLD_LEVEL, share) * self._torque_limits
+        level = np.maximum(level, np.minimum(self._steps, MOST_STEPS * self._torque_limits))
         self._allow(
             Allowed(
                 low,

@@ -157,6 +157,7 @@ def run_trial(
     *,
     trusts_loops: bool,
     louder: FloatArray | None = None,
+    steps: FloatArray | None = None,
     report: Report = lambda _: None,
     exciting: Callable[[], AbstractContextManager[object]] = nullcontext,
 ) -> Tried:
@@ -174,7 +175,7 @@ def run_trial(
         Gets each experiment's raw data once the drives are off, also when it was cut short.
     name
         Whose loops are tried, for the experiments' names: ``before``, ``after``.
-    trusts_loops, louder
+    trusts_loops, louder, steps
         See :class:`OscillationWatch`.
     report
         Is told how far the excitation is.
@@ -197,6 +198,7 @@ def run_trial(
         trial.cycle_time,
         trusts_loops=trusts_loops,
         louder=louder,
+        steps=steps,
         units=axes.units,
     )
     rests: list[Capture] = []
@@ -205,11 +207,11 @@ def run_trial(
     try:
         with mover.motion(trial.cycle_time) as motion:
             start = mover.held
-            steps = _Steps(motion, watch, axes, still, start, name, kept)
+            doing = _Steps(motion, watch, axes, still, start, name, kept)
             for move in trial.moves:
-                steps.nudge(move)
+                doing.nudge(move)
             for move in trial.moves:
-                steps.move(move)
+                doing.move(move)
             come_to_rest(motion, axes, start)
         if trial.excitation is not None:
             there = replace(axes, centre=start)
