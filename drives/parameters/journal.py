@@ -115,6 +115,9 @@ class DriveRecord:
     memory: Memory = Memory.UNTOUCHED
     memory_before: Memory = Memory.UNTOUCHED
     """What it was before storing began: it stays so if the drive refuses to store."""
+    earlier: Memory = Memory.UNTOUCHED
+    """What earlier writes had left there, seen from the first backup; counts while this one has left
+    ``memory`` untouched."""
 
 
 _BEGUN = {

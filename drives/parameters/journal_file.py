@@ -92,6 +92,7 @@ def _body(journal: Journal) -> dict[str, Any]:
                 "phase": record.phase.value,
                 "memory": record.memory.value,
                 "memory_before": record.memory_before.value,
+                "memory_earlier": record.earlier.value,
                 "parameters": [
                     {
                         "name": entry.info.name,
@@ -162,6 +163,7 @@ def _record(item: Mapping[str, Any], place: list[str | int]) -> DriveRecord:
         _word(Phase, item["phase"]),
         _word(Memory, item["memory"]),
         _word(Memory, item["memory_before"]),
+        _word(Memory, item.get("memory_earlier", Memory.UNTOUCHED.value)),
     )
 
 

@@ -30,10 +30,9 @@ from drives.parameters import (
     load_journal,
 )
 from drives.parameters.journal import Goal
+from fieldtool.writeback.earlier import FIRST_BACKUP, memory_seen_from
 from fieldtool.writeback.transaction import tell_storing
 from fieldtool.writeback.unfinished import JOURNAL, JournalKeeper, not_kept
-
-FIRST_BACKUP = "parameters-before.yaml"
 
 
 @dataclass(frozen=True)
@@ -262,11 +261,13 @@ def journal_back(machine: str, source: Source, store: bool) -> Journal:
 def _record_back(part: DriveBackup, source: Source) -> DriveRecord:
     entries: tuple[JournalEntry, ...] = ()
     memory = Memory.UNKNOWN if source.lost_journal else Memory.UNTOUCHED
+    earlier = memory
     if source.journal is not None:
         old = {held.info.address: held.value for held in part.held}
         for record in source.journal.drives:
             if record.axis == part.axis:
-                memory = record.memory
+                memory = memory_seen_from(source.backup_path.name, source.journal, record)
+                earlier = record.earlier
                 entries = tuple(
                     JournalEntry(e.info, old.get(e.info.address, e.before), e.after)
                     for e in record.entries
@@ -282,4 +283,5 @@ def _record_back(part: DriveBackup, source: Source) -> DriveRecord:
         Phase.GOING_BACK,
         memory,
         memory,
+        earlier,
     )

@@ -9,6 +9,7 @@ from drives.canopen_drive import CanopenDrive
 from drives.parameters import Storing
 from drives.parameters.journal import Goal
 from fieldtool.writeback.backups import take_backup
+from fieldtool.writeback.earlier import left_before
 from fieldtool.writeback.transaction import planned_journal
 from fieldtool.writeback.unfinished import JOURNAL, JournalKeeper, not_kept
 
@@ -20,6 +21,7 @@ def backed_up(machine: str, drives: Sequence[CanopenDrive], backup_path: Path) -
     A measurement switches feed-forward off and arms fail-safe objects, and puts them back when it
     ends, however it ends.  If the tool is killed it can not; then the note makes the next session
     ask for ``fieldtool restore``, so that no later backup takes such values for the machine's own.
+    The journal of a write that has ended is put back afterwards: it says what the drives have stored.
 
     Raises
     ------
@@ -28,14 +30,16 @@ def backed_up(machine: str, drives: Sequence[CanopenDrive], backup_path: Path) -
     """
     backup = take_backup(machine, drives, backup_path)
     keeper = JournalKeeper(backup.with_name(JOURNAL))
-    journal = planned_journal(machine, drives, (), backup.name, Storing.NONE)
+    earlier = left_before(keeper.path, drives)
+    journal = planned_journal(machine, drives, (), backup.name, Storing.NONE, earlier)
     journal = replace(journal, goal=Goal.OLD).turned_back(distrust=True)
     with keeper:
         try:
+            before = keeper.ended_before()
             keeper(journal)
         except OSError as error:
             raise not_kept(keeper, error) from error
         try:
             yield
         finally:
-            keeper.forget(journal)
+            keeper.forget(journal, before)

@@ -1,6 +1,6 @@
 """Bring new parameters into the drives: all or nothing, read back, undoable."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -13,6 +13,7 @@ from drives.parameters import (
     DriveRecord,
     Journal,
     JournalEntry,
+    Memory,
     Step,
     Storing,
     Transaction,
@@ -25,6 +26,7 @@ from drives.parameters import (
 from drives.profile import Store
 from fieldtool.design.tuning import Tuning
 from fieldtool.writeback.backups import take_backup
+from fieldtool.writeback.earlier import left_before
 from fieldtool.writeback.unfinished import JOURNAL, JournalKeeper, not_kept, refuse_unfinished
 
 Confirm = Callable[[Sequence[Change]], bool]
@@ -160,8 +162,10 @@ def apply_changes(
         return WriteBack((), changes, in_memory=False, stored=False, backup=backup_path)
     check_disabled(drives)
     storing = Storing.ALL if keep else Storing.NONE
-    journal = planned_journal(machine, drives, changes, backup_path.name, storing)
-    keeper = JournalKeeper(backup_path.with_name(JOURNAL))
+    journal_path = backup_path.with_name(JOURNAL)
+    earlier = left_before(journal_path, drives)
+    journal = planned_journal(machine, drives, changes, backup_path.name, storing, earlier)
+    keeper = JournalKeeper(journal_path)
     backup = load_backup(backup_path)
     transaction = Transaction(
         drives, journal, backup, keeper, tell_storing(drives, say), prove, stop_requested
@@ -196,8 +200,12 @@ def planned_journal(
     changes: Sequence[Change],
     backup: str,
     storing: Storing,
+    earlier: Mapping[str, Memory],
 ) -> Journal:
-    """Return the journal of a write of which nothing is done yet."""
+    """Return the journal of a write of which nothing is done yet.
+
+    ``earlier`` is what the writes before it have left (:func:`left_before`).
+    """
     return Journal(
         machine,
         datetime.now(UTC).isoformat(timespec="seconds"),
@@ -216,6 +224,7 @@ def planned_journal(
                     for change in changes
                     if change.axis == drive.axis
                 ),
+                earlier=earlier.get(drive.axis, Memory.UNTOUCHED),
             )
             for drive in drives
         ),

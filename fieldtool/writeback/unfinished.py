@@ -88,13 +88,22 @@ class JournalKeeper:
                 if record.phase is Phase.ROLLED_BACK:
                     remove_durably(_note_of(journal.machine, record))
 
-    def forget(self, journal: Journal) -> None:
-        """Remove journal and notes, because nothing is left to be taken back.
+    def ended_before(self) -> bytes | None:
+        """Return the journal that is there, word by word; None if it is open, or there is none."""
+        if not self.path.is_file() or _may_be_open(self.path):
+            return None
+        return self.path.read_bytes()
+
+    def forget(self, journal: Journal, before: bytes | None) -> None:
+        """Put the journal from before back, and remove the notes: nothing is left to be taken back.
 
         What can not be removed does no harm: there will be nothing to restore.
         """
         with suppress(OSError):
-            remove_durably(self.path)
+            if before is None:
+                remove_durably(self.path)
+            else:
+                write_durably(self.path, before)
             for record in journal.drives:
                 remove_durably(_note_of(journal.machine, record))
 

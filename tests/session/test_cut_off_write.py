@@ -465,3 +465,82 @@ def test_a_session_at_work_is_not_taken_for_one_that_was_cut_off(bench):
         assert "another fieldtool is at work" in outcome.err
         assert "cut off" not in outcome.err
     assert bench.command("restore", folder).code == 0
+
+
+# --- what was stored before ----------------------------------------------------------------------
+
+STORED_NEW = {"table": "new", "arm": "new"}
+
+
+def told_memory(outcome):
+    assert outcome.code == 0, outcome.err
+    return {d["axis"]: d["non_volatile_memory"] for d in json.loads(outcome.out)["drives"]}
+
+
+def retune(session, **gains):
+    path = session.out / "tuning.yaml"
+    tuning = yaml.safe_load(path.read_text())
+    for axis in tuning["axes"]:
+        axis["parameters"].update(gains)
+    path.write_text(yaml.safe_dump(tuning))
+
+
+def measured(session, *, killed):
+    """Hold what a measurement holds, and end it, or leave everything as a dead process would."""
+    with connect(load_machine(session.profile)) as group:
+        held = backed_up("bench", group.drives, session.out / "parameters-before.yaml")
+        held.__enter__()
+        if not killed:
+            held.__exit__(None, None, None)
+            return
+        held.gen.gi_frame.f_locals["keeper"].__exit__()  # the lock of a dead process is free
+        session.killed = held  # not ended by the garbage collector either
+
+
+def test_a_trial_does_not_forget_what_an_earlier_write_stored(session):
+    assert session.command("write", session.out, "--yes", "--store").code == 0
+    journal = (session.out / "write-journal.yaml").read_bytes()
+    measured(session, killed=False)
+    assert (session.out / "write-journal.yaml").read_bytes() == journal
+    assert told_memory(session.command("restore", session.out, "--json")) == STORED_NEW
+    power_cycle(session)
+    assert session.changed() != {}, "as it was said"
+
+
+def test_a_trial_that_was_killed_does_not_forget_it_either(session):
+    assert session.command("write", session.out, "--yes", "--store").code == 0
+    measured(session, killed=True)
+    first = session.command("restore", session.out, "--json")
+    assert told_memory(first) == {"table": "untouched", "arm": "untouched"}, "by the measurement"
+    assert json.loads(first.out)["cut_off"] is True
+    assert told_memory(session.command("restore", session.out, "--json")) == STORED_NEW
+    assert session.changed() == {}
+
+
+@pytest.mark.parametrize("how", ["not stored", "refused", "cut off"])
+def test_a_later_write_carries_on_what_the_first_stored(session, cut_off, how):
+    assert session.command("write", session.out, "--yes", "--store").code == 0
+    retune(session, velocity_p=2.2)
+    if how == "cut off":
+        cut_off(1)
+        assert session.command("restore", session.out).code == 0
+    else:
+        if how == "refused":
+            session.machine.node(ARM).dictionary.guards[VELOCITY_P] = lambda _: 0x08000022
+        code = session.command("write", session.out, "--yes").code
+        assert code == (6 if how == "refused" else 0)
+        session.machine.node(ARM).dictionary.guards.clear()
+    assert told_memory(session.command("restore", session.out, "--json")) == STORED_NEW
+    assert session.changed() == {}
+    back = session.command("restore", session.out, "--store", "--json")
+    assert told_memory(back) == {"table": "old", "arm": "old"}
+    power_cycle(session)
+    assert session.changed() == {}
+
+
+def test_a_lost_journal_makes_a_later_one_say_that_it_does_not_know(session):
+    assert session.command("write", session.out, "--yes", "--store").code == 0
+    (session.out / "write-journal.yaml").write_text("damaged")
+    assert session.command("write", session.out, "--yes").code == 0
+    told = told_memory(session.command("restore", session.out, "--json"))
+    assert told == {"table": "unknown", "arm": "unknown"}

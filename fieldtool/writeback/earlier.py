@@ -1,0 +1,53 @@
+"""What earlier writes from a session folder have left in the drives' non-volatile memory.
+
+No drive tells what it has stored, so what is known must not be lost: each journal in a folder takes it
+over from the one whose place it takes.
+"""
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+from drives.errors import ProfileError
+from drives.parameters import DriveRecord, Journal, Memory, load_journal
+from drives.parameters.values import ParameterDrive
+
+FIRST_BACKUP = "parameters-before.yaml"
+"""From before the tool changed anything: what ``fieldtool restore FOLDER`` brings back."""
+
+
+def left_before(journal_file: Path, drives: Iterable[ParameterDrive]) -> Mapping[str, Memory]:
+    """Return what each drive's non-volatile memory is known to hold before a new journal, by axis.
+
+    Seen from the folder's first backup: ``OLD`` are that backup's values.  ``UNKNOWN`` where the
+    journal that would say it can not be read; a drive that was exchanged has nothing of it.
+    """
+    if not journal_file.is_file():
+        return {}
+    try:
+        journal = load_journal(journal_file)
+    except ProfileError:
+        return {drive.axis: Memory.UNKNOWN for drive in drives}
+    here = {
+        (d.axis, d.identity.vendor_id, d.identity.product_code, d.identity.serial_number)
+        for d in drives
+    }
+    return {
+        record.axis: memory_seen_from(FIRST_BACKUP, journal, record)
+        for record in journal.drives
+        if (record.axis, record.vendor_id, record.product_code, record.serial_number) in here
+    }
+
+
+def memory_seen_from(backup: str, journal: Journal, record: DriveRecord) -> Memory:
+    """Return what a drive's non-volatile memory holds: old values are those of this backup.
+
+    Of a write that was cut off it is what that write itself has done: taking it back stores nothing
+    that it had not stored.
+    """
+    if record.memory is Memory.UNTOUCHED:
+        if journal.is_open or record.earlier is Memory.UNTOUCHED:
+            return Memory.UNTOUCHED
+        return record.earlier if backup == FIRST_BACKUP else Memory.UNKNOWN
+    if record.memory is Memory.OLD and backup != journal.backup:
+        return Memory.UNKNOWN
+    return record.memory
