@@ -48,7 +48,7 @@ peak to peak, and the inertia that is fed forward makes torque of it."""
 NOT_AS_SAID, FASTER_THAN_SAID = 1.25, 1.5
 """Factors by which a peak of sensitivity, and a bandwidth, may be off what the tuning says."""
 STANDSTILL_TIME, STANDSTILL_TIMEOUT = 0.25, 120.0
-STANDSTILL_COUNTS, STANDSTILL_TRAVEL = 3.0, 2e-5
+STANDSTILL_COUNTS, STANDSTILL_TRAVEL = 3.0, 2e-4
 """A disabled axis stands that moves by less than so many counts, or this share of its travel, in so many
 seconds, twice; waited for at most."""
 ACCELERATES = 0.6
