@@ -13,8 +13,9 @@ of doubt is all that can be had, one without a word is wrong.
 A second table has machines with a faint mode: the noise is such that it stands 1 to 20 standard errors
 out of it.  Counted is what was found, whether a sentence names a frequency near that mode (5 %), and
 whether lengths that are wrong come without any word of doubt.  Below about 6 standard errors noise alone
-looks like such a mode somewhere in the band (once in a hundred machines): what stands lower is not to be
-seen by anybody, and the machine without it explains all that was measured.
+looks like such a mode somewhere in the band (once in a hundred machines), and between 6 and 10 the other
+modes can still take over what it does: there the machine without it may explain all that was measured,
+and nothing is said.
 
 Run: python tests/benchmarks/bench_order.py [machines] [seed]
 """
