@@ -10,6 +10,7 @@ class Stood:
     """A verification that tries nothing."""
 
     result = None
+    not_stored = ""
 
     def __init__(self, *_: Any, **__: Any) -> None:
         pass

@@ -14,7 +14,7 @@ from fieldtool import workflow
 from fieldtool.cli.criticise import SearchBar
 from fieldtool.cli.output import Json, console_of, print_json
 from fieldtool.design.predict import AxisPrediction
-from fieldtool.design.tuning import BOUND, RESPONSES, Tuning
+from fieldtool.design.tuning import BOUND, MOST_BOUND, RESPONSES, Tuning
 from fieldtool.design.tuning_file import tuning_as_dict
 
 Figure = Callable[[AxisPrediction], float | None]
@@ -67,8 +67,10 @@ def design(
 ) -> None:
     """Design controller parameters from the session folder's model, and predict what they do."""
     check_response(response)
-    if not (isfinite(bound) and bound > 1.1):
-        raise typer.BadParameter(f"--bound is a number above 1.1, got {bound:g}")
+    if not 1.1 < bound <= MOST_BOUND:
+        raise typer.BadParameter(
+            f"--bound is a number above 1.1, and {MOST_BOUND:g} at most; got {bound:g}"
+        )
     console = console_of(as_json)
     with SearchBar(console) as bar:
         tuning = workflow.redesign(folder, response, bound, png, bar)

@@ -19,6 +19,7 @@ from fieldtool.design.servo import Servo
 from fieldtool.design.shaping import Shaping, best_shaper
 from fieldtool.design.tuning import (
     BOUND,
+    MOST_BOUND,
     RESPONSES,
     AxisTuning,
     TradePoint,
@@ -89,6 +90,10 @@ def design(
         raise DesignError(
             f"a peak of sensitivity of {allowed:.3g} is below what any loop has; choose --bound above "
             "1.1."
+        )
+    if not bound <= MOST_BOUND:
+        raise DesignError(
+            f"a bound of {bound:.3g} leaves no margin; choose --bound up to {MOST_BOUND:g}."
         )
     sides = [DriveSide(axis.name) for axis in model.axes] if sides is None else list(sides)
     moves = default_moves(model, sides) if moves is None else tuple(moves)
@@ -232,6 +237,11 @@ def _tuning(
             notes.append(
                 f"{side.axis}: its present parameters can not be compared: {side.unreadable}"
             )
+    if task.bound > BOUND:
+        notes.append(
+            f"The peak of sensitivity may be up to {task.bound:.3g} here, above {BOUND:g}: these "
+            "parameters may be tried on the machine, and are never stored."
+        )
     return Tuning(
         tuple(axes),
         response,

@@ -17,6 +17,31 @@ RESPONSES: Mapping[str, float] = {"soft": 0.4, "normal": 0.7, "stiff": 1.0}
 """A technician's choices: how much of the room between 1 and the bound the peak of sensitivity uses."""
 BOUND = 2.0
 """Peak of sensitivity that no axis may exceed: 6 dB."""
+MOST_BOUND = 3.0
+"""That anybody may ask for; what goes beyond ``BOUND`` may be tried, and is never stored."""
+
+
+def why_not_stored(bound: float, *, identified: bool) -> str:
+    """Return why parameters are not stored even if they stand their trial; empty if they may be.
+
+    Parameters
+    ----------
+    bound
+        Of the peak of sensitivity, that they were designed for and are judged by.
+    identified
+        Whether the prediction rests on an identified model.
+    """
+    if not bound <= BOUND * (1 + 1e-9):
+        return (
+            f"their bound of the peak of sensitivity is {bound:.3g}, above {BOUND:g}: with so little "
+            "margin they may be tried, and are never stored"
+        )
+    if not identified:
+        return (
+            "the session has no identified model (model.yaml), so their trial can not be compared with "
+            "a prediction: measure, or `fieldtool identify`, first"
+        )
+    return ""
 
 
 @dataclass(frozen=True)

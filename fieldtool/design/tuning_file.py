@@ -11,7 +11,7 @@ from pydantic import Field
 from fieldtool.design.moves import TestMove
 from fieldtool.design.predict import Prediction, finite
 from fieldtool.design.shaping import Shaping
-from fieldtool.design.tuning import BOUND, AxisTuning, TradePoint, Tuning
+from fieldtool.design.tuning import BOUND, MOST_BOUND, AxisTuning, TradePoint, Tuning
 from fieldtool.errors import FileFormatError
 from fieldtool.records.yaml_file import Number, StrictModel, read_checked
 
@@ -73,7 +73,7 @@ class _Shaping(StrictModel):
 class _TuningFile(StrictModel):
     format: Literal["fieldtool-tuning/1"]
     response: str = ""
-    bound: Number = Field(default=BOUND, gt=1)
+    bound: Number = Field(default=BOUND, gt=1, le=MOST_BOUND)
     axes: list[_Axis] = Field(min_length=1)
     moves: list[_Move] = Field(default_factory=list)
     prediction: _Prediction | None = None

@@ -27,7 +27,7 @@ from fieldtool.design.measured import (
 )
 from fieldtool.design.predict import Prediction
 from fieldtool.design.servo import Servo
-from fieldtool.design.tuning import Tuning
+from fieldtool.design.tuning import Tuning, why_not_stored
 from fieldtool.design.verdict import Comparison, faults
 from fieldtool.errors import IdentificationError, OutputError
 from fieldtool.experiment.axes import Axes
@@ -141,6 +141,8 @@ class Verification:
             {axis.axis: axis.sensitivity_peak for axis in tuning.axes} if believed else {}
         )
         self._bound, self._tuning = tuning.bound, tuning
+        self.not_stored = why_not_stored(tuning.bound, identified=believed)
+        """Why the new parameters are not stored even if they stand their trial; empty if they may be."""
         self._setting = setting_of(session.machine, group, model)
         self._axes: Axes = axes_of(group, self._setting)
         self._plan: TrialPlan | None = None

@@ -71,6 +71,15 @@ def written(
     verification = None
     if options.verify:
         verification = Verification(session, group, tuning, model, believed=believed)
+        if verification.not_stored and options.store:
+            raise PlanRefusedError(
+                f"the new parameters are not stored: {verification.not_stored}. Leave --store away to "
+                "try them. Nothing was moved or written."
+            )
+        if verification.not_stored:
+            session.warn(
+                f"CAREFUL, the new parameters are for a trial only: {verification.not_stored}."
+            )
         verification.plan(changes_for(group.drives, tuning))
 
     def agreed(changes: Sequence[Change]) -> bool:

@@ -310,3 +310,41 @@ def test_ctrl_c_after_the_last_motion_stores_nothing(session, monkeypatch, momen
     assert session.changed() == {}, "nothing new was left in non-volatile memory"
     if moment == "judging":
         assert verification(session)["verdict"] == "restored"
+
+
+def with_bound(session, bound):
+    path = session.out / "tuning.yaml"
+    path.write_text(path.read_text() + f"bound: {bound}\n")
+
+
+@pytest.mark.parametrize("bound", [3.01, 1000, 1e300])
+def test_a_bound_that_leaves_no_margin_is_refused(session, bound):
+    with_bound(session, bound)
+    outcome = write(session)
+    assert outcome.code == 2
+    assert "bound" in outcome.err
+    assert "3" in outcome.err
+    assert session.changed() == {}
+
+
+def test_a_bound_above_the_usual_one_is_said_and_never_stored(session):
+    with_bound(session, 2.5)
+    session.listen()
+    outcome = write(session, "--store")
+    assert outcome.code == 3, outcome.err
+    assert "2.5, above 2" in outcome.err
+    told = session.command("write", session.out)  # nobody answers: nothing is tried
+    assert "CAREFUL" in " ".join((told.out + told.err).split())
+    assert not [f for f in session.heard() if f.cob_id == 0x80], "no SYNC: nothing moved"
+    assert session.changed() == {}
+
+
+def test_without_an_identified_model_nothing_is_stored(session):
+    (session.out / "model.yaml").unlink()
+    session.listen()
+    outcome = write(session, "--store")
+    assert outcome.code == 3, outcome.err
+    assert "no identified model" in outcome.err
+    assert not [f for f in session.heard() if f.cob_id == 0x80], "no SYNC: nothing moved"
+    assert session.changed() == {}
+    assert session.stored() == {TABLE: {}, ARM: {}}

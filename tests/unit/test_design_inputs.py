@@ -89,7 +89,8 @@ def test_the_command_says_what_is_there_and_what_will_be(
     assert data["present"]["stable"] is True
     assert yaml.safe_load(folder.tuning.read_text()) == data
     assert main_code(["design", str(folder.path), "--response", "wild"]) == 2
-    assert main_code(["design", str(folder.path), "--bound", "1"]) == 2
+    for bound in ("1", "3.1", "nan"):
+        assert main_code(["design", str(folder.path), "--bound", bound]) == 2
     before = folder.tuning.read_bytes()
     folder.model.unlink()
     assert main_code(["design", str(folder.path)]) == 2
