@@ -34,12 +34,14 @@ def list_tools(machine: Machine, as_json: Json = False) -> None:
     found = workflow.tools_of(machine)
     console = console_of(as_json)
     if as_json:
-        print_json({"tools": [tool.as_dict() for tool in found]})
+        print_json(found.as_dict())
         return
-    if not found:
+    if found.whole:
+        console.print(_tools_table(found.whole))
+    elif not found.bad:
         console.print("No tool set is kept yet: fieldtool tools keep MACHINE NAME --from SESSION")
-        return
-    console.print(_tools_table(found))
+    for name, problem in found.bad.items():
+        console.print(Text(f"  {name}: can not be used. {problem}"))
 
 
 @tools_app.command()
