@@ -122,7 +122,8 @@ def switch(
     """Write a tool set into the drives: backup, write, read back; nothing moves."""
     console = console_of(as_json)
     folder = out or Path("sessions") / f"{Path(machine).stem}-{name}-{datetime.now():%Y%m%d-%H%M%S}"
-    with stop_key() as key, TerminalScreen(console) as screen:
+    taking_back = "Stopping; what was written is taken back ..."
+    with stop_key(taking_back) as key, TerminalScreen(console) as screen:
         result = workflow.switch_tool(
             on_bus(machine, interface, channel, bitrate),
             name,

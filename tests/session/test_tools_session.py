@@ -2,11 +2,13 @@
 
 import json
 import shutil
+import signal
 
 import pytest
 import yaml
 
 from drives.canopen_drive import connect
+from drives.parameters import Transaction
 from drives.profile import load_machine
 from drives.sim.faults import SdoRefused
 from fieldtool.records.model_file import write_model
@@ -295,3 +297,24 @@ def test_what_a_measurement_that_was_cut_off_left_in_the_drives_is_no_tool_set(s
     assert outcome.code == 3, outcome.err
     assert "fieldtool restore" in outcome.err
     assert not tool_file("bare").exists()
+
+
+@pytest.mark.usefixtures("untried")
+def test_a_stop_while_a_set_is_written_takes_it_back(session, tmp_path, monkeypatch):
+    """Also right after the tool has asked for one."""
+    heed = Transaction._heed_stop
+
+    def pressed(one):
+        assert not one._stop_requested()
+        signal.raise_signal(signal.SIGINT)
+        heed(one)
+
+    tools(session, "keep", "bare")
+    session.command("write", session.out, "--yes")
+    written = session.changed()
+    monkeypatch.setattr(Transaction, "_heed_stop", pressed)
+    outcome = tools(session, "switch", "bare", "--yes", "--out", tmp_path / "one")
+    assert outcome.code == 130, outcome.err
+    assert "what was written is taken back" in outcome.err
+    assert "All drives hold the old values" in outcome.err
+    assert session.changed() == written
