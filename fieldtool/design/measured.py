@@ -49,7 +49,9 @@ class Sensitivity:
         return self._top()[0]
 
     def _top(self) -> tuple[float, float]:
-        k = int(np.argmax(self.size))
+        k = int(np.argmax(self.size))  # what is no number comes first
+        if not np.all(self.size[max(k - 1, 0) : k + 2] > 0):
+            return float(self.frequency[k]), float(self.size[k])
         if not 0 < k < self.size.size - 1:
             return float(self.frequency[k]), float(self.size[k])
         x, y = np.log(self.frequency[k - 1 : k + 2]), np.log(self.size[k - 1 : k + 2])

@@ -5,6 +5,7 @@ old parameters, is it what was predicted.  All figures of a comparison come from
 """
 
 from dataclasses import dataclass
+from math import isfinite, isnan
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,9 @@ CYCLES = 3.0
 RINGS = 1.5
 """Times the old vibration, and the old overshoot, or those predicted, that the new ones may have; half
 the band about the target counts as nothing."""
+LEAST_PEAK = 0.5
+"""No loop's sensitivity stays below it over a band that reaches far above its bandwidth (Bode's
+integral): where it seems to, the torque that was told did not follow the excitation."""
 PEAK_OFF = 0.2
 """Share by which a measured peak of sensitivity may be off the predicted one."""
 CURVE_OFF = 0.35
@@ -85,15 +89,45 @@ def faults(one: Comparison, cycle: float, bound: float, *, believed: bool) -> tu
     believed
         Whether the prediction rests on an identified model; it is not judged by where it does not.
     """
-    after = one.after
+    before, after = one.before, one.after
     if after is None:
         return (f"{one.axis}: was not measured with the new parameters",)
-    found = _margins(one, after, bound)
-    if one.before is not None:
-        found += _worse(one, one.before, after, cycle)
-    if one.predicted is not None and believed:
+    found = _unmeasured(after, "new") + _margins(one, after, bound)
+    if before is None:
+        found.append(
+            "was not measured with the old parameters, so nothing says that it is no worse"
+        )
+    else:
+        found += _unmeasured(before, "old", sensitivity=False) + _worse(one, before, after, cycle)
+    if believed and one.predicted is None:
+        found.append("nothing was predicted of it, so nothing says that it is as designed")
+    elif believed and one.predicted is not None:
         found += _unlike(one, one.predicted, after, cycle)
     return tuple(f"{one.axis}: {text}" for text in found)
+
+
+def _unmeasured(figures: AxisFigures, whose: str, *, sensitivity: bool = True) -> list[str]:
+    """Return what is no number: nothing is left in the drives by what was not seen.
+
+    That it did not settle is an infinite time, and a measurement.
+    """
+    names = {
+        "settling time": isnan(figures.settling_time),
+        "overshoot": not isfinite(figures.overshoot),
+        "vibration": not isfinite(figures.vibration),
+        "following error": not isfinite(figures.following_error),
+        "torque": not isfinite(figures.peak_torque),
+    }
+    peak = figures.sensitivity_peak
+    if sensitivity:
+        names["sensitivity"] = peak is None or not isfinite(peak) or peak < LEAST_PEAK
+    return [
+        f"its {name} with the {whose} parameters was not measured, so they are not kept"
+        if whose == "new"
+        else f"its {name} with the {whose} parameters was not measured, so nothing can be compared"
+        for name, lacks in names.items()
+        if lacks
+    ]
 
 
 def _margins(one: Comparison, after: AxisFigures, bound: float) -> list[str]:
@@ -139,15 +173,16 @@ def _unlike(one: Comparison, expected: AxisFigures, after: AxisFigures, cycle: f
             f"predicted; {allowed:.2g} s more is taken"
         )
     wanted, peak = expected.sensitivity_peak, after.sensitivity_peak
-    if wanted and peak and abs(peak / wanted - 1) > PEAK_OFF:
+    if wanted and peak and not abs(peak / wanted - 1) <= PEAK_OFF:
         found.append(
             f"its peak of sensitivity is {peak:.3g}, {wanted:.3g} was predicted; "
             f"{100 * PEAK_OFF:.0f} % off is taken"
         )
     measured, predicted = one.sensitivity_after, one.sensitivity_predicted
     if measured is not None and predicted is not None:
-        apart = float(np.median(np.abs(np.log(measured.size / predicted.size))))
-        if apart > CURVE_OFF:
+        with np.errstate(all="ignore"):
+            apart = float(np.median(np.abs(np.log(measured.size / predicted.size))))
+        if not apart <= CURVE_OFF:  # nor if it is no number
             found.append(
                 f"its sensitivity is off the predicted one by a factor of {np.exp(apart):.2g} over its "
                 f"frequencies; {np.exp(CURVE_OFF):.2g} is taken: its loop is not the one that was "

@@ -50,8 +50,9 @@ def draw_verification(
         _draw_move(row[0], one, before, foreseen, after)
         _draw_error(row[1], one, before, foreseen, after)
         _draw_sensitivity(row[2], one)
-    plots[0, 0].legend(loc="best", fontsize=8)
-    plots[0, 2].legend(loc="best", fontsize=8)
+    for plot in (plots[0, 0], plots[0, 2]):
+        if plot.get_legend_handles_labels()[0]:
+            plot.legend(loc="best", fontsize=8)
     try:
         figure.savefig(path, dpi=110)
     except OSError as error:
@@ -103,6 +104,8 @@ def _draw_move(
     plot: Axes, one: Comparison, before: History, foreseen: History, after: History
 ) -> None:
     parts = _parts(one, before, foreseen, after)
+    if _empty(plot, f"{one.axis}: move", [part for _, _, _, part in parts]):
+        return
     measured = next((part for _, _, _, part in parts if part is not None), None)
     if measured is not None:
         plot.plot(measured[0], measured[1], ":", color=REFERENCE, lw=1.0, label="reference")
@@ -133,6 +136,8 @@ def _draw_error(
     plot: Axes, one: Comparison, before: History, foreseen: History, after: History
 ) -> None:
     parts = _parts(one, before, foreseen, after)
+    if _empty(plot, f"{one.axis}: distance from the target", [part for _, _, _, part in parts]):
+        return
     plot.axhspan(-one.band, one.band, color="#e8ecf1")
     for name, colour, style, part in parts:
         if part is not None:
@@ -146,7 +151,20 @@ def _draw_error(
     plot.grid(visible=True, alpha=0.25)
 
 
+def _empty(plot: Axes, title: str, shown: Sequence[object | None]) -> bool:
+    """Say that a panel has nothing to show, where it has nothing."""
+    if any(one is not None for one in shown):
+        return False
+    plot.set_title(f"{title}: not measured", loc="left", fontsize=10)
+    plot.set_axis_off()
+    return True
+
+
 def _draw_sensitivity(plot: Axes, one: Comparison) -> None:
+    curves = [one.sensitivity_before, one.sensitivity_predicted, one.sensitivity_after]
+    shown = [c for c in curves if c is not None and np.any(c.size > 0)]
+    if _empty(plot, f"{one.axis}: sensitivity", shown):
+        return
     for name, colour, style, curve in (
         ("before", BEFORE, "-", one.sensitivity_before),
         ("after", AFTER, "o-", one.sensitivity_after),

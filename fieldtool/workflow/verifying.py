@@ -6,14 +6,20 @@ is stored, the new ones.  What the trial raises takes the write back.
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
 from drives.canopen_drive import CanopenGroup
-from drives.errors import NotVerifiedError, OscillationError, StoppedError, UserStopError
+from drives.errors import (
+    NotVerifiedError,
+    OscillationError,
+    StoppedError,
+    UserStopError,
+    WriteBackMixedError,
+)
 from drives.parameters import Change
 from fieldtool.design.loops import Loops
 from fieldtool.design.machine import machine_of, respond
@@ -36,7 +42,12 @@ from fieldtool.experiment.verification.trial import Tried, run_trial
 from fieldtool.records.model import FloatArray, MachineModel
 from fieldtool.records.recording import Experiment, RecordingWriter
 from fieldtool.records.yaml_file import write_yaml
-from fieldtool.report.verification_picture import draw_verification, foreseen_move, same_times
+from fieldtool.report.verification_picture import (
+    History,
+    draw_verification,
+    foreseen_move,
+    same_times,
+)
 from fieldtool.workflow.preparation import axes_of, recording_header, setting_of
 from fieldtool.workflow.session import Session
 from fieldtool.workflow.trial_plan import (
@@ -111,7 +122,7 @@ class Verified:
 
 
 class Verification:
-    """The trial of one write; its steps are called in order: plan, before, prove.
+    """The trial of one write; its steps are called in order: plan, before, prove, ended.
 
     Parameters
     ----------
@@ -149,7 +160,9 @@ class Verification:
         self._changes: tuple[Change, ...] = ()
         self._old: Tried | None = None
         self._recorder: RecordingWriter | None = None
+        self._histories: list[tuple[Comparison, History, History]] = []
         self.result: Verified | None = None
+        """What the trial showed; ``verified`` is no more than a judgement before :meth:`ended`."""
 
     def plan(self, changes: Sequence[Change]) -> TrialPlan:
         """Plan the trial for what a write changes; nothing moves.
@@ -206,6 +219,7 @@ class Verification:
         self._session.screen.stage(
             "Try the new parameters: hold still, small moves, small excitation"
         )
+        self._forget_earlier()
         tried: Tried | None = None
         reasons: tuple[str, ...] = ("the trial was cut short",)
         try:
@@ -230,6 +244,14 @@ class Verification:
             raise NotVerifiedError(
                 f"the new parameters do not stand their trial: {'; '.join(reasons)}"
             )
+
+    def _forget_earlier(self) -> None:
+        """Remove the verdict of a write before: the drives do not hold those values any more."""
+        path = self._session.folder.verification
+        try:
+            path.unlink(missing_ok=True)
+        except OSError as error:
+            raise OutputError(f"{path}: can not be removed ({error.strerror})") from error
 
     @property
     def _planned(self) -> TrialPlan:
@@ -363,15 +385,15 @@ class Verification:
         )
 
     def _conclude(self, tried: Tried | None, reasons: tuple[str, ...]) -> None:
-        """Keep what was found; a disk that is full must not hide it."""
+        """Say what was found; what the drives are left with is not known yet."""
         compared = self._compared(tried)
-        histories = [
+        self._histories = [
             (one, self._history(self._old, k), self._history(tried, k))
             for k, one in enumerate(compared)
         ]
         moves = (
             same_times(one, before, foreseen_move(self._planned.after, k), after)
-            for k, (one, before, after) in enumerate(histories)
+            for k, (one, before, after) in enumerate(self._histories)
         )
         self.result = Verified(
             "restored" if reasons else "verified",
@@ -384,16 +406,37 @@ class Verification:
             self._planned.notes,
             tuple(moves),
         )
-        folder = self._session.folder
-        folder.note("verified", verdict=self.result.verdict, reasons=list(reasons))
         self._session.screen.verified(self.result)
+
+    def ended(self, error: BaseException | None) -> None:
+        """Keep what came of it, once the write has ended: ``verified`` only if it ended well.
+
+        Neither a disk that is full nor a picture that can not be drawn hides it.
+
+        Parameters
+        ----------
+        error
+            What took the write back, or kept it from beginning; None if the drives hold the new values.
+        """
+        if self.result is None:
+            return
+        if error is not None:
+            reasons = self.result.reasons or (str(error) or type(error).__name__,)
+            if isinstance(error, WriteBackMixedError) and str(error) not in reasons:
+                reasons = (*reasons, str(error))
+            self.result = replace(self.result, verdict="restored", reasons=reasons)
+        folder = self._session.folder
+        folder.note("verified", verdict=self.result.verdict, reasons=list(self.result.reasons))
         try:
             write_yaml(folder.verification, self.result.as_dict())
-            draw_verification(histories, self._planned.after, folder.verification_picture)
-        except OutputError as error:
-            self._session.warn(str(error))
+        except OutputError as failed:
+            self._session.warn(str(failed))
+        try:
+            draw_verification(self._histories, self._planned.after, folder.verification_picture)
+        except Exception as failed:
+            self._session.warn(f"{folder.verification_picture}: not drawn ({failed})")
 
-    def _history(self, tried: Tried | None, k: int) -> tuple[FloatArray, ...] | None:
+    def _history(self, tried: Tried | None, k: int) -> History:
         """Return time, reference, position of an axis' own move, from where it began."""
         one = None if tried is None else tried.move(self._axes.names[k])
         if one is None or one.position_reference is None:

@@ -92,17 +92,24 @@ def written(
         session.screen.stage("Write the new parameters, and read them back")
         return True
 
-    result = apply(
-        session.machine.name,
-        group.drives,
-        tuning,
-        session.folder.parameters_before,
-        agreed,
-        options.store,
-        session.screen.say,
-        verification.prove if verification else None,
-        group.stop_requested,
-    )
+    try:
+        result = apply(
+            session.machine.name,
+            group.drives,
+            tuning,
+            session.folder.parameters_before,
+            agreed,
+            options.store,
+            session.screen.say,
+            verification.prove if verification else None,
+            group.stop_requested,
+        )
+    except BaseException as error:
+        if verification is not None:
+            verification.ended(error)
+        raise
+    if verification is not None:
+        verification.ended(None)
     session.folder.note("parameters", rows=parameter_table(result))
     session.folder.note("write", written=result.in_memory, stored=result.stored)
     if result.in_memory and verification is None:

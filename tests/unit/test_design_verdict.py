@@ -1,0 +1,69 @@
+"""The verdict on new parameters: what was not measured never passes for good."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fieldtool.design.measured import AxisFigures, Sensitivity
+from fieldtool.design.verdict import Comparison, faults
+
+GOOD = AxisFigures(0.1, 0.5, 0.001, 0.01, 0.001, 1.0, 1.5, 10.0)
+FREQUENCY = np.array([5.0, 10.0, 20.0])
+CURVE = Sensitivity(FREQUENCY, np.array([0.8, 1.5, 1.2]))
+
+
+def told(before=GOOD, predicted=GOOD, after=GOOD, *, measured=CURVE, believed=True):
+    one = Comparison("x", "rad", 1.0, 0.5, 0.01, before, predicted, after, None, CURVE, measured)
+    return faults(one, 0.001, 2.0, believed=believed)
+
+
+def curve(size):
+    return Sensitivity(FREQUENCY, np.full(3, size))
+
+
+def test_what_is_good_has_no_fault():
+    assert told() == ()
+    slow = replace(GOOD, settling_time=np.inf)
+    assert told(before=slow) == (), "the old ones never settled: it is better now"
+
+
+@pytest.mark.parametrize("believed", [True, False])
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+@pytest.mark.parametrize(
+    "name", ["settling_time", "overshoot", "vibration", "following_error", "peak_torque"]
+)
+def test_a_figure_that_is_no_number_is_a_fault(name, value, believed):
+    found = told(after=replace(GOOD, **{name: value}), believed=believed)
+    assert found
+    assert "was not measured" in found[0] or "does not settle" in found[0]
+    if name != "settling_time" or np.isnan(value):
+        assert told(before=replace(GOOD, **{name: value}), believed=believed)
+
+
+@pytest.mark.parametrize("believed", [True, False])
+@pytest.mark.parametrize("peak", [None, np.nan, np.inf, 0.0, 1e-17])
+def test_a_sensitivity_that_was_not_measured_is_a_fault(peak, believed):
+    """Also one that a torque shows that stands still, or that is not told anew."""
+    found = told(after=replace(GOOD, sensitivity_peak=peak), believed=believed)
+    assert any("sensitivity" in text for text in found)
+
+
+@pytest.mark.parametrize("size", [np.nan, 0.0, 1e-17])
+def test_a_curve_that_is_no_measurement_has_no_peak_and_is_off_the_prediction(size):
+    bad = curve(size)
+    assert np.isnan(bad.peak) or bad.peak < 1e-9
+    assert any("off the predicted one" in text for text in told(measured=bad))
+
+
+@pytest.mark.parametrize("believed", [True, False])
+def test_nothing_to_compare_with_is_a_fault(believed):
+    never = replace(GOOD, settling_time=np.inf)
+    found = told(before=None, predicted=never, believed=believed)
+    assert any("old parameters" in text for text in found)
+    assert told(after=None, believed=believed)
+
+
+def test_a_prediction_that_is_believed_has_to_be_there():
+    assert told(predicted=None)
+    assert told(predicted=None, believed=False) == ()
