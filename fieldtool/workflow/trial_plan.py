@@ -19,6 +19,7 @@ from fieldtool.experiment.verification.excitation import (
     expected_peaks,
     sensitivity_plan,
 )
+from fieldtool.experiment.verification.swings import Swings
 from fieldtool.experiment.verification.trial import Trial, TrialMove
 from fieldtool.records.closed_loop import AxisLoop
 from fieldtool.records.model import FloatArray
@@ -51,6 +52,11 @@ STANDSTILL_TIME, STANDSTILL_TIMEOUT = 0.25, 120.0
 STANDSTILL_COUNTS, STANDSTILL_TRAVEL = 3.0, 2e-4
 """A disabled axis stands that moves by less than so many counts, or this share of its travel, in so many
 seconds, twice; waited for at most."""
+UNFORESEEN, OFF_TARGET = 2.0, 0.05
+"""Times what is predicted that an axis may swing and be off its target once its reference stands; and
+the share of the way by which it may be off besides."""
+FINE_SWING = 0.02
+"""Of the limit of torque, or of the band about the target: smaller swings are left out."""
 ACCELERATES = 0.6
 """Share of the time to speed up below which a torque that turns back is not the move's own."""
 
@@ -308,8 +314,44 @@ def _trial_move(
     )
     rest = min(max(REST * settles, LEAST_REST, move.duration), MOST_REST)
     rise, held, _ = move.parts
+    half = ACCELERATES * (2 * rise + held)
+    swings, astray = _coming_to_rest(move, k, limits[k], predictions)
     reference = move.reference(cycle)
-    return TrialMove(k, reference, round(rest / cycle), torque, ACCELERATES * (2 * rise + held))
+    return TrialMove(k, reference, round(rest / cycle), torque, half, swings, astray)
+
+
+def _coming_to_rest(
+    move: TestMove, k: int, limit: float, predictions: Sequence[Prediction]
+) -> tuple[tuple[float, float] | None, float]:
+    """Return how far an axis may swing once its reference stands, and how far it may be off its target.
+
+    Every prediction counts UNFORESEEN times; None and infinite where there is none.
+    """
+    curves = [one.axes[k].curves for one in predictions]
+    after = [(c.torque, c.position, c.time >= move.duration) for c in curves if c is not None]
+    if len(after) < len(curves):
+        return None, np.inf
+    torque = max(_second_swing(t[rest], FINE_SWING * limit) for t, _, rest in after)
+    position = max(_second_swing(p[rest], FINE_SWING * move.settling_band) for _, p, rest in after)
+    sign = np.sign(move.distance)
+    off = max(
+        float(
+            max(
+                np.abs(p[rest] - move.distance).max(initial=0.0), (sign * (p - move.distance)).max()
+            )
+        )
+        for _, p, rest in after
+    )
+    astray = UNFORESEEN * off + OFF_TARGET * abs(move.distance)
+    return (UNFORESEEN * torque, UNFORESEEN * position), astray
+
+
+def _second_swing(signal: FloatArray, fine: float) -> float:
+    """Return the second largest swing from turn to turn: what an alarm after two of them would see."""
+    swings = Swings()
+    swings.restart(fine)
+    sizes = [swings.sizes[-1] for value in signal.tolist() if swings.take(value)]
+    return sorted([0.0, 0.0, *sizes])[-2]
 
 
 def _without_feed_forward(drive: CanopenDrive, servo: Servo) -> AxisLoop:

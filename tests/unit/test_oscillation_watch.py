@@ -109,6 +109,95 @@ def test_a_move_out_and_back_is_left_alone():
     assert first_alarm(one, out, torque) is None
 
 
+SHORT = 0.05
+"""Half period of a quick move, s: nothing slower than 10 Hz swings by it."""
+
+
+def settled(one, foreseen=(0.8, 0.01), beside=lambda _: 0.0):
+    """Let the first axis have come to 1 rad by a quick move; it may be 0.3 rad off."""
+    axes = len(one._names)
+    one.hold(np.zeros(axes))
+    ends = np.full(axes, 0.7), np.full(axes, 1.3)
+    one.move(np.full(axes, -1.0), np.full(axes, 2.0), np.full(axes, 9.0), SHORT, axis=0)
+    for k in range(100):
+        torques = [2 * np.sin(2 * np.pi * k / 99), *[beside(k * STEP)] * (axes - 1)]
+        assert one.take([k / 99] * axes, torques) is None
+    one.settle(*ends, np.full(axes, 9.0), SHORT, 0, foreseen)
+    return one
+
+
+@settings(max_examples=40, deadline=None)
+@given(frequency=st.floats(2.2, 60.0), share=st.floats(0.1, 0.9), phase=st.floats(0.0, 6.28))
+def test_a_slow_swing_about_the_target_is_found_within_two_of_its_periods(frequency, share, phase):
+    t = np.arange(2000) * STEP
+    swing = share * LIMITS.torque * np.sin(2 * np.pi * frequency * t + phase)
+    found = first_alarm(settled(watch()), 1 + 0 * t, swing)
+    assert found is not None
+    assert found * STEP <= 2.0 / frequency + 0.01
+
+
+@settings(max_examples=40, deadline=None)
+@given(frequency=st.floats(2.2, 60.0), phase=st.floats(0.0, 6.28))
+def test_a_position_that_swings_about_the_target_without_torque_is_found(frequency, phase):
+    t = np.arange(2000) * STEP
+    swing = 1 + 0.25 * np.sin(2 * np.pi * frequency * t + phase)
+    found = first_alarm(settled(watch()), swing, 0 * t)
+    assert found is not None
+    assert found * STEP <= 2.0 / frequency + 0.01
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    frequency=st.floats(2.2, 60.0),
+    damping=st.floats(0.0, 0.3),
+    size=st.floats(0.1, 4.0),
+    wrong=st.floats(0.0, 0.95),
+)
+def test_what_the_model_foresees_after_a_move_is_left_alone(frequency, damping, size, wrong):
+    """Levels are what is foreseen, peak to peak; also where it hardly dies out."""
+    t = np.arange(2000) * STEP
+    ring = np.exp(-2 * np.pi * frequency * damping * t) * np.cos(2 * np.pi * frequency * t)
+    one = settled(watch(), (2 * size, 0.02))
+    assert first_alarm(one, 1 + wrong * 0.01 * ring, wrong * size * ring) is None
+
+
+@settings(max_examples=30, deadline=None)
+@given(frequency=st.floats(2.2, 60.0), share=st.floats(0.2, 0.3))
+def test_an_axis_beside_that_swings_on_when_all_should_rest_is_found(frequency, share):
+    """Without a prediction what dies out is left alone, what does not is found within four periods."""
+    for dying, found in ((0.05, False), (0.0, True)):
+
+        def swing(time, dying=dying):
+            turn = 2 * np.pi * frequency * time
+            return float(share * LIMITS.torque * np.exp(-dying * turn) * np.cos(turn))
+
+        one = settled(watch(axes=2), beside=swing)
+        alarm = None
+        for k in range(4000):
+            alarm = one.take([1.0, 1.0], [0.0, swing(0.1 + k * STEP)])
+            if alarm:
+                break
+        assert (alarm is not None) == found
+        if alarm:
+            assert alarm.axis == "x1"
+            assert k * STEP <= 4.6 / frequency + 0.01
+
+
+def test_turns_of_the_move_itself_do_not_count_when_it_rests():
+    one = settled(watch(), (0.8, 0.01))
+    assert first_alarm(one, np.ones(500), np.zeros(500)) is None
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("which", ["position", "torque"])
+def test_what_is_no_number_is_an_alarm_at_once(bad, which):
+    for one in (watch(), moving(watch()), settled(watch())):
+        values = (bad, 0.0) if which == "position" else (1.0, bad)
+        alarm = one.take(*([v] for v in values))
+        assert alarm is not None
+        assert "no number" in alarm.sentence
+
+
 def test_noise_below_the_level_is_left_alone(fresh_rng):
     noise = np.clip(fresh_rng.normal(0, 0.12, 20_000), -0.39, 0.39)
     assert first_alarm(watch(), np.zeros(20_000), noise) is None

@@ -11,15 +11,18 @@ swings
     signal has come back by the level.
 growth
     Where swings are to be expected (what rings after a move dies out) they count if they grow, or are
-    far above the level.
+    far above the level, or do not die out once all references stand.
 
 An oscillation of frequency f is found some ``(turns + 1) / (2 f)`` after its swing is larger than the
-level; one that is slower than ``half_period`` leaves the corridor first.  Valid while the level is
-above noise: the levels are shares of limits, and grow with the encoder's counts.
+level, if its turns follow within ``half_period``.  While a reference moves that is shorter than the
+move's own turns, and a slower oscillation is stopped by corridor and torque bound, or in the rest after
+the move: there turns may follow within LONGEST_HALF.  Valid while the level is above noise: the levels
+are shares of limits, and grow with the encoder's counts.  What is no number is an alarm.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from math import isfinite
 
 import numpy as np
 
@@ -40,6 +43,8 @@ LEAPS, FAST = 1.3, 3
 are so many times faster than they have to be."""
 FAR_ABOVE = 5.0
 """Times the level: swings of this size count whether they grow or not."""
+LASTS, DIES = 7, 0.9
+"""At rest a swing has to be smaller than DIES times the one three periods before it."""
 MOST_STEPS = 0.6
 """Share of the torque limit by which steps of the targets may make a torque swing, at most."""
 LONGEST_HALF = 0.25
@@ -69,6 +74,12 @@ class Allowed:
     """Whether the torque of the time being is that at rest."""
     half_period: float = LONGEST_HALF
     """Seconds from one turn to the next, at most, to count as one oscillation."""
+    settled: bool = False
+    """Whether all references stand: what began since then may turn as slowly as LONGEST_HALF."""
+    moving: int | None = None
+    """The axis whose reference moves, where only one does."""
+    foreseen: int | None = None
+    """The axis whose levels hold all that its model foresees: there every swing counts."""
 
 
 class OscillationWatch:
@@ -122,6 +133,7 @@ class OscillationWatch:
         self._positions = [Swings() for _ in self._names]
         self._rest: list[float] = []
         self._allowed: Allowed | None = None
+        self._since = 0
         self.alarm: Alarm | None = None
         """What ended the motion."""
 
@@ -158,11 +170,14 @@ class OscillationWatch:
         torque: FloatArray,
         half_period: float = LONGEST_HALF,
         *,
+        axis: int | None = None,
         gentle: bool = False,
     ) -> None:
         """Allow motion inside corridors (M,), with torques up to (M,) about those at rest.
 
-        A gentle one makes no swings of its own worth the name: they count as at rest.
+        ``axis`` is the one that moves; on the others a torque that swings far above the level counts
+        however slowly it turns.  A gentle one makes no swings of its own worth the name: they count as
+        at rest.
         """
         share = HOLD_LEVEL if gentle else MOVE_LEVEL
         level = np.maximum(self._louder * HOLD_LEVEL, share) * self._torque_limits
@@ -178,17 +193,63 @@ class OscillationWatch:
                 growing=not gentle,
                 resting=False,
                 half_period=min(half_period, LONGEST_HALF),
+                moving=axis,
+            )
+        )
+
+    def settle(
+        self,
+        low: FloatArray,
+        high: FloatArray,
+        torque: FloatArray,
+        half_period: float,
+        axis: int,
+        foreseen: tuple[float, float] | None,
+    ) -> None:
+        """Allow what is left of a move once its reference stands.
+
+        Parameters
+        ----------
+        low, high, torque, half_period
+            As for :meth:`move`; the half period is for swings that began before.
+        axis
+            That moved.
+        foreseen
+            Peak to peak of its torque and of its position while it comes to rest, at most; larger ones
+            count as at rest.  None: not known; then swings count that do not die out.
+        """
+        self.move(low, high, torque, half_period)
+        allowed = self._allowed
+        if allowed is None:
+            raise AssertionError("a move was allowed")
+        torque_swing, position_swing = allowed.torque_swing.copy(), allowed.position_swing.copy()
+        if foreseen is not None:
+            at_rest = float(self._louder[axis]) * HOLD_LEVEL * float(self._torque_limits[axis])
+            torque_swing[axis] = max(at_rest, float(self._steps[axis]), foreseen[0])
+            position_swing[axis] = max(float(self._position_swing[axis]), foreseen[1])
+        self._since = self._torques[axis].now
+        self._allow(
+            replace(
+                allowed,
+                torque_swing=torque_swing,
+                position_swing=position_swing,
+                settled=True,
+                moving=None,
+                foreseen=None if foreseen is None else axis,
             )
         )
 
     def excite(self, low: FloatArray, high: FloatArray, torque: FloatArray) -> None:
-        """Allow motion that swings by itself inside corridors (M,), with torques up to (M,)."""
+        """Allow motion that swings by itself inside corridors (M,), with torques up to (M,).
+
+        Corridor and bound are what ends it: swings of the torque say nothing here.
+        """
         self._allow(
             Allowed(
                 low,
                 high,
                 torque,
-                1.2 * 2 * torque,
+                np.full(torque.size, np.inf),
                 np.full(torque.size, np.inf),
                 MOVE_TURNS,
                 growing=True,
@@ -235,6 +296,8 @@ class OscillationWatch:
 
     def _judge(self, k: int, position: float, torque: float, allowed: Allowed) -> str:
         """Return what is wrong with an axis, in words; empty where nothing is."""
+        if not (isfinite(position) and isfinite(torque)):
+            return f"its position is told as {position:g} and its torque as {torque:g}: no numbers"
         turned = self._torques[k].take(torque)
         swung = self._positions[k].take(position)
         unit, torque_unit = self._units[k]
@@ -254,8 +317,8 @@ class OscillationWatch:
             (self._torques[k], turned, "torque", torque_unit),
             (self._positions[k], swung, "position", unit),
         ):
-            if seen and self._oscillates(swings, allowed):
-                frequency = swings.frequency(allowed.turns) / self._step
+            if seen and self._oscillates(k, swings, allowed):
+                frequency = swings.frequency(self._turns(k, allowed)) / self._step
                 return (
                     f"oscillates at about {frequency:.3g} Hz: its {what} swings by "
                     f"{swings.sizes[-1]:.3g} {of}, peak to peak, above the level of "
@@ -263,19 +326,36 @@ class OscillationWatch:
                 )
         return ""
 
-    def _oscillates(self, swings: Swings, allowed: Allowed) -> bool:
+    @staticmethod
+    def _turns(k: int, allowed: Allowed) -> int:
+        return HOLD_TURNS if allowed.foreseen == k else allowed.turns
+
+    def _oscillates(self, k: int, swings: Swings, allowed: Allowed) -> bool:
         """Whether the swings, of which one was completed just now, are an oscillation."""
         longest = int(allowed.half_period / self._step) + 1
         if allowed.growing and self._leaps(swings.series(longest // FAST + 1)):
             return True
-        if not swings.within(allowed.turns, longest):
+        if self._counts(k, swings.series(longest), swings.level, allowed):
+            return True
+        slow = int(LONGEST_HALF / self._step) + 1
+        if allowed.moving not in (None, k) and swings is self._torques[k]:
+            last = swings.series(slow)[-allowed.turns :]
+            return len(last) == allowed.turns and min(last) > FAR_ABOVE * swings.level
+        if not allowed.settled:
             return False
-        if not allowed.growing:
+        series = swings.series(slow, self._since)
+        if self._counts(k, series, swings.level, allowed):
             return True
-        if min(swings.sizes[-allowed.turns :]) > FAR_ABOVE * swings.level:
+        return len(series) >= LASTS and series[-1] > DIES * series[-LASTS]
+
+    def _counts(self, k: int, series: list[float], level: float, allowed: Allowed) -> bool:
+        """Whether swings that follow each other are enough for an alarm."""
+        turns = self._turns(k, allowed)
+        if len(series) < turns:
+            return False
+        if not allowed.growing or allowed.foreseen == k:
             return True
-        series = swings.series(longest)
-        return series[-1] > GROWS * min(series[-3::-2])
+        return min(series[-turns:]) > FAR_ABOVE * level or series[-1] > GROWS * min(series[-3::-2])
 
     @staticmethod
     def _leaps(series: list[float]) -> bool:

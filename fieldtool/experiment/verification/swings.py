@@ -24,6 +24,11 @@ class Swings:
     _high: float = float("-inf")
     _now: int = 0
 
+    @property
+    def now(self) -> int:
+        """Samples taken so far."""
+        return self._now
+
     def restart(self, level: float) -> None:
         """Forget all turns, and look for those of another level from the next sample on."""
         self.level, self.sizes, self.times, self._rising = level, [], [], None
@@ -59,18 +64,17 @@ class Swings:
         del self.sizes[:-MOST_KEPT], self.times[: -MOST_KEPT - 1]
         return True
 
-    def series(self, longest: int) -> list[float]:
-        """Return the sizes of the last swings, each of them at most so many samples after another."""
+    def series(self, longest: int, since: int = 0) -> list[float]:
+        """Return the sizes of the last swings, each of them at most so many samples after another.
+
+        Only those that began after a sample count.
+        """
         count = 0
         for a, b in pairwise(self.times[::-1]):
-            if a - b > longest:
+            if a - b > longest or b <= since:
                 break
             count += 1
         return self.sizes[len(self.sizes) - min(count, len(self.sizes)) :]
-
-    def within(self, count: int, longest: int) -> bool:
-        """Whether there are so many swings, each at most so many samples after the one before."""
-        return len(self.series(longest)) >= count
 
     def frequency(self, count: int) -> float:
         """Return the mean frequency of the last swings, periods a sample."""

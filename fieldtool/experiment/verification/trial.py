@@ -4,7 +4,7 @@ Nothing is trusted that has not been seen: the axes first stand still, then each
 its move, then each makes its move and comes back, then all are excited a little at the same time.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
@@ -47,6 +47,8 @@ PUSHED_ERROR = 0.3
 """Share of its following error limit by which an axis may be pushed that does not move itself."""
 SLICE_TIME = 0.02
 """Seconds that are sent at a time."""
+SENT_AHEAD = 2
+"""Slices that are on their way when a row is asked for, at most."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +63,13 @@ class TrialMove:
     torque: FloatArray
     """How far torques may go from those at rest meanwhile, shape (M,)."""
     half_period: float = LONGEST_HALF
-    """Seconds from turn to turn below which torque and position do not turn by what is commanded."""
+    """Seconds from turn to turn below which torque and position do not turn by what is commanded while
+    the reference moves."""
+    swings: tuple[float, float] | None = None
+    """Peak to peak of torque and position of the axis once its reference stands, at most; None: not
+    known."""
+    astray: float = np.inf
+    """Distance from the target once the reference stands, at most, rad or m."""
 
     @property
     def distance(self) -> float:
@@ -121,8 +129,14 @@ def still_allowed(axes: Axes) -> FloatArray:
 class WatchedMover:
     """Gives enabled axes that were seen to stand still first, with a watch that looks at every cycle."""
 
-    def __init__(self, group: Mover, watch: OscillationWatch, rests: list[Capture]) -> None:
-        self._group, self._watch, self._rests = group, watch, rests
+    def __init__(
+        self,
+        group: Mover,
+        watch: OscillationWatch,
+        rests: list[Capture],
+        cut_off: Callable[[Capture, str], None],
+    ) -> None:
+        self._group, self._watch, self._rests, self._cut_off = group, watch, rests, cut_off
         self.held = np.zeros(0)
         """Targets at which the axes of the motion were seen to stand, shape (M,): going on from there is
         no jolt, which it would be from where they are."""
@@ -144,8 +158,17 @@ class WatchedMover:
             self._watch.hold(start)
             self.held = start
             still = np.tile(start, (max(2, round(HOLD_TIME / cycle_time)), 1))
-            self._rests.append(motion.stream(_slices(still, cycle_time)))
+            self._rests.append(self.follow(motion, still))
             yield motion
+
+    def follow(self, motion: Motion, targets: FloatArray) -> Capture:
+        """Follow targets, shape (n, M); what was captured of it is kept if it is stopped."""
+        try:
+            return motion.stream(_slices(targets, motion.cycle_time))
+        except StoppedError as error:
+            if isinstance(error.capture, Capture) and error.capture.rows > 1:
+                self._cut_off(error.capture, str(error))
+            raise
 
 
 def run_trial(
@@ -202,8 +225,12 @@ def run_trial(
         units=axes.units,
     )
     rests: list[Capture] = []
-    mover = WatchedMover(group, watch, rests)
     kept: list[Experiment] = []
+
+    def cut_off(capture: Capture, why: str) -> None:
+        kept.append(_recorded(capture, (), f"{name}: standing still", trial.cycle_time, why))
+
+    mover = WatchedMover(group, watch, rests, cut_off)
     try:
         with mover.motion(trial.cycle_time) as motion:
             start = mover.held
@@ -259,39 +286,61 @@ class _Steps:
         pause = np.full(max(2, round(NUDGE_TIME / step)), 1.0)
         path = np.concatenate([there, size * pause, size - there, 0 * pause])
         torque = NUDGE_TORQUE * np.array([one.torque for one in axes.limits])
-        self._allow(k, size, np.minimum(torque, move.torque), NUDGE_TIME / 3, gentle=True)
+        low, high = self._ways(k, size, BEYOND * abs(size))
+        torque = np.minimum(torque, move.torque)
+        self._watch.move(low, high, torque, NUDGE_TIME / 3, axis=k, gentle=True)
         self._stream(path, move.axis, f"{self._name}: nudge of {axes.names[k]}", keep=False)
 
     def move(self, move: TrialMove) -> None:
         """Go the whole way, rest, come back, rest."""
         out, rest = move.reference, np.ones(move.rest)
         path = np.concatenate([out, move.distance * rest, move.distance - out, 0 * rest])
-        allow = partial(self._allow, move.axis, move.distance, move.torque, move.half_period)
-        allow()
+        self._allow(move)
         name = f"{self._name}: move of {self._axes.names[move.axis]}"
-        turn = out.size + move.rest, partial(allow, back=True)
-        self._stream(path, move.axis, name, turn=turn)
+        half = out.size + move.rest
+        late = SENT_AHEAD * round(SLICE_TIME / self._motion.cycle_time)
+        turns = [(half, partial(self._allow, move, back=True))]
+        if late < move.rest:
+            turns = [
+                (out.size + late, partial(self._settle, move, back=False)),
+                *turns,
+                (half + out.size + late, partial(self._settle, move, back=True)),
+            ]
+        self._stream(path, move.axis, name, turns=turns)
 
-    def _allow(
-        self,
-        k: int,
-        distance: float,
-        torque: FloatArray,
-        half_period: float,
-        *,
-        gentle: bool = False,
-        back: bool = False,
-    ) -> None:
-        """Allow an axis its way out, or the way back, which may be overshot at its own end."""
+    def _settle(self, move: TrialMove, *, back: bool) -> None:
+        """Allow the axis what is left of its move, about its target."""
+        k = move.axis
+        low, high = self._ways(k, move.distance, self._beyond(move), back=back)
+        target = float(self._start[k]) + (0.0 if back else move.distance)
+        room = move.astray + SHAKEN * float(self._still[k])
+        low[k], high[k] = max(low[k], target - room), min(high[k], target + room)
+        self._watch.settle(low, high, move.torque, move.half_period, k, move.swings)
+
+    def _allow(self, move: TrialMove, *, back: bool = False) -> None:
+        """Allow an axis its way out, or the way back."""
+        low, high = self._ways(move.axis, move.distance, self._beyond(move), back=back)
+        self._watch.move(low, high, move.torque, move.half_period, axis=move.axis)
+
+    @staticmethod
+    def _beyond(move: TrialMove) -> float:
+        """Return how far the axis may go beyond the end of its way, rad or m."""
+        return min(BEYOND * abs(move.distance), move.astray)
+
+    def _ways(
+        self, k: int, distance: float, beyond: float, *, back: bool = False
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the corridors of a way, which may be overshot at its own end."""
         errors = np.array([one.following_error for one in self._axes.limits])
         slack = np.maximum(CHECK_PUSHED * self._still, PUSHED_ERROR * errors)
         low, high = self._start - slack, self._start + slack
         slack_k = SHAKEN * float(self._still[k])
-        before, after = (BEYOND, BEHIND) if back else (BEHIND, BEYOND)
-        ends = (-before * distance, (1 + after) * distance)
+        size, behind = abs(distance), BEHIND * abs(distance)
+        way = (-beyond, size + behind) if back else (-behind, size + beyond)
+        ends = way if distance > 0 else (-way[0], -way[1])
         low[k] = self._start[k] + min(ends) - slack_k
         high[k] = self._start[k] + max(ends) + slack_k
-        self._watch.move(low, high, torque, half_period, gentle=gentle)
+        return low, high
 
     def _stream(
         self,
@@ -300,13 +349,13 @@ class _Steps:
         name: str,
         *,
         keep: bool = True,
-        turn: "Turn | None" = None,
+        turns: "Sequence[Turn]" = (),
     ) -> None:
         """Follow a path."""
         targets = np.tile(self._start, (path.size, 1))
         targets[:, k] += path
         try:
-            capture = self._motion.stream(_slices(targets, self._motion.cycle_time, turn))
+            capture = self._motion.stream(_slices(targets, self._motion.cycle_time, turns))
         except StoppedError as error:
             if isinstance(error.capture, Capture) and error.capture.rows > 1:
                 self._kept.append(self._experiment(error.capture, k, name, str(error)))
@@ -315,20 +364,28 @@ class _Steps:
             self._kept.append(self._experiment(capture, k, name))
 
     def _experiment(self, capture: Capture, k: int, name: str, note: str = "") -> Experiment:
-        return Experiment(
-            name=name,
-            kind="moves",
-            driven=(self._axes.names[k],),
-            free=(),
-            period=None,
-            time=sample_times(capture.rows, self._motion.cycle_time),
-            position=capture.position,
-            torque=capture.torque,
-            position_reference=capture.position_reference,
-            statusword=capture.statusword,
-            complete=not note and not capture.missing,
-            note=note or ("samples are missing" if capture.missing else ""),
-        )
+        driven = (self._axes.names[k],)
+        return _recorded(capture, driven, name, self._motion.cycle_time, note)
+
+
+def _recorded(
+    capture: Capture, driven: tuple[str, ...], name: str, cycle_time: float, note: str
+) -> Experiment:
+    """Return a capture as an experiment; a note says what cut it short."""
+    return Experiment(
+        name=name,
+        kind="moves",
+        driven=driven,
+        free=(),
+        period=None,
+        time=sample_times(capture.rows, cycle_time),
+        position=capture.position,
+        torque=capture.torque,
+        position_reference=capture.position_reference,
+        statusword=capture.statusword,
+        complete=not note and not capture.missing,
+        note=note or ("samples are missing" if capture.missing else ""),
+    )
 
 
 class _Excited:
@@ -362,7 +419,7 @@ class _Excited:
             u = np.arange(1, round(NUDGE_TIME / cycle_time) + 1) * cycle_time / NUDGE_TIME
             rises = u**3 * (10 - 15 * u + 6 * u * u)
             way = self._mover.held + np.outer(rises, self._start - self._mover.held)
-            motion.stream(_slices(way, cycle_time))
+            self._mover.follow(motion, way)
             yield _Standing(motion, way[-1])
 
 
@@ -378,25 +435,24 @@ Turn = tuple[int, Callable[[], None]]
 """A row, and what is done before it is sent."""
 
 
-def _slices(targets: FloatArray, step: float, turn: Turn | None = None) -> "_Slices":
-    return _Slices(targets, max(2, round(SLICE_TIME / step)), turn)
+def _slices(targets: FloatArray, step: float, turns: Sequence[Turn] = ()) -> "_Slices":
+    return _Slices(targets, max(2, round(SLICE_TIME / step)), turns)
 
 
 class _Slices:
     """Targets in slices; a ``drives.api.Source``."""
 
-    def __init__(self, targets: FloatArray, rows: int, turn: Turn | None = None) -> None:
-        self._targets, self._rows, self._done, self._turn = targets, rows, 0, turn
+    def __init__(self, targets: FloatArray, rows: int, turns: Sequence[Turn] = ()) -> None:
+        self._targets, self._rows, self._done, self._turns = targets, rows, 0, list(turns)
 
     def __call__(self, _before: Capture | None) -> FloatArray | None:
         if self._done >= self._targets.shape[0]:
             return None
         end = self._done + self._rows
-        if self._turn is not None and self._done == self._turn[0]:
-            self._turn[1]()
-            self._turn = None
-        if self._turn is not None and self._done < self._turn[0]:
-            end = min(end, self._turn[0])
+        if self._turns and self._done == self._turns[0][0]:
+            self._turns.pop(0)[1]()
+        if self._turns:
+            end = min(end, self._turns[0][0])
         part = self._targets[self._done : end]
         self._done += part.shape[0]
         return part
