@@ -29,9 +29,9 @@ from drives.errors import (
     WriteBackError,
     WriteBackMixedError,
 )
-from drives.parameters import Change
 from drives.profile import MachineProfile
 from fieldtool import workflow
+from fieldtool.cli.asking import may_write
 from fieldtool.cli.bus_options import Bitrate, Channel, Interface, on_bus
 from fieldtool.cli.check import check
 from fieldtool.cli.criticise import criticise
@@ -46,12 +46,11 @@ from fieldtool.cli.scan import scan
 from fieldtool.cli.screen import (
     TerminalScreen,
     model_table,
-    parameter_table_of,
     show_parameters,
     show_result,
 )
 from fieldtool.cli.simulate import simulate
-from fieldtool.cli.stop_key import StopKey, may_move, somebody_there, stop_key
+from fieldtool.cli.stop_key import StopKey, may_move, stop_key
 from fieldtool.cli.tools import tools_app
 from fieldtool.cli.tracing import TraceFile, TraceWanted, trace_path
 from fieldtool.errors import (
@@ -63,7 +62,6 @@ from fieldtool.errors import (
     PlanRefusedError,
 )
 from fieldtool.records.session_folder import SessionFolder
-from fieldtool.writeback.transaction import WriteBack
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -202,26 +200,6 @@ def _tried(verify: bool, store: bool) -> bool:
     return verify
 
 
-def _asker(
-    console: Console, yes: bool, key: StopKey, store: bool
-) -> Callable[[Sequence[Change]], bool]:
-    def ask(changes: Sequence[Change]) -> bool:
-        key.check()
-        if yes:
-            return True
-        planned = WriteBack((), tuple(changes), in_memory=False, stored=False, backup=None)
-        console.print(parameter_table_of(planned, console.width))
-        if not somebody_there():
-            console.print(
-                "  Not written: there is nobody to ask. Use --yes to write without asking."
-            )
-            return False
-        where = "working memory, and store them" if store else "working memory (not stored)"
-        return typer.confirm(f"Write these parameters into the drives' {where}?", err=True)
-
-    return ask
-
-
 @app.command()
 def run(
     machine: Machine,
@@ -261,7 +239,7 @@ def run(
             folder,
             options,
             screen=_StoppableScreen(screen, key),
-            confirm=_asker(console, yes, key, store),
+            confirm=may_write(console, key, yes=yes, store=store),
             stop_requested=key,
         )
     show_result(console, result)
@@ -463,7 +441,7 @@ def write(
     options = workflow.Options(write=True, store=store, verify=_tried(verify, store), trace=traced)
     with stop_key() as key, TerminalScreen(console, may_move(yes)) as screen:
         stoppable = _StoppableScreen(screen, key)
-        ask = _asker(console, yes, key, store)
+        ask = may_write(console, key, yes=yes, store=store)
         profile = on_bus(SessionFolder.existing(folder).profile, interface, channel, bitrate)
         result = workflow.write(
             folder, options, ask, screen=stoppable, machine=profile, stop_requested=key

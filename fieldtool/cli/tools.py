@@ -1,24 +1,22 @@
 """``fieldtool tools``: parameter sets of several tool set-ups of one machine."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from drives.parameters import Change
 from fieldtool import workflow
+from fieldtool.cli.asking import may_write
 from fieldtool.cli.bus_options import Bitrate, Channel, Interface, on_bus
 from fieldtool.cli.output import Json, console_of, print_json
-from fieldtool.cli.screen import TerminalScreen, parameter_table_of, show_parameters
-from fieldtool.cli.stop_key import StopKey, somebody_there, stop_key
+from fieldtool.cli.screen import TerminalScreen, show_parameters
+from fieldtool.cli.stop_key import stop_key
 from fieldtool.workflow.tools import Difference
 from fieldtool.writeback.tool_sets import ToolSet
-from fieldtool.writeback.transaction import WriteBack
 
 tools_app = typer.Typer(
     no_args_is_help=True,
@@ -34,12 +32,14 @@ def list_tools(machine: Machine, as_json: Json = False) -> None:
     found = workflow.tools_of(machine)
     console = console_of(as_json)
     if as_json:
-        print_json({"tools": [tool.as_dict() for tool in found]})
+        print_json(found.as_dict())
         return
-    if not found:
+    if found.whole:
+        console.print(_tools_table(found.whole))
+    elif not found.bad:
         console.print("No tool set is kept yet: fieldtool tools keep MACHINE NAME --from SESSION")
-        return
-    console.print(_tools_table(found))
+    for name, problem in found.bad.items():
+        console.print(Text(f"  {name}: can not be used. {problem}"))
 
 
 @tools_app.command()
@@ -120,19 +120,21 @@ def switch(
     """Write a tool set into the drives: backup, write, read back; nothing moves."""
     console = console_of(as_json)
     folder = out or Path("sessions") / f"{Path(machine).stem}-{name}-{datetime.now():%Y%m%d-%H%M%S}"
-    with stop_key() as key, TerminalScreen(console) as screen:
+    taking_back = "Stopping; what was written is taken back ..."
+    with stop_key(taking_back) as key, TerminalScreen(console) as screen:
         result = workflow.switch_tool(
             on_bus(machine, interface, channel, bitrate),
             name,
             folder,
-            _asker(console, key, yes=yes),
+            may_write(console, key, yes=yes, store=store),
             store=store,
             same_drives=same_drives,
             screen=screen,
             stop_requested=key,
         )
     show_parameters(console, result)
-    console.print(Text(f"  `fieldtool restore {folder}` takes it back."))
+    if result.in_memory:
+        console.print(Text(f"  `fieldtool restore {folder}` takes it back."))
     if as_json:
         print_json(
             {
@@ -142,23 +144,6 @@ def switch(
                 "parameters": workflow.parameter_table(result),
             }
         )
-
-
-def _asker(console: Console, key: StopKey, *, yes: bool) -> Callable[[Sequence[Change]], bool]:
-    """Return what shows old and new values, and asks."""
-
-    def ask(changes: Sequence[Change]) -> bool:
-        key.check()
-        if yes:
-            return True
-        planned = WriteBack((), tuple(changes), in_memory=False, stored=False, backup=None)
-        console.print(parameter_table_of(planned, console.width))
-        if not somebody_there():
-            console.print("  Not written: nobody to ask. Use --yes to write without asking.")
-            return False
-        return typer.confirm("Write these parameters into the drives?", err=True)
-
-    return ask
 
 
 def _tools_table(tools: Sequence[ToolSet]) -> Table:

@@ -212,7 +212,7 @@ def _head(path: Path, payload: bytes, recording: Recording) -> float:
     try:
         head = json.loads(payload)
         axes, period = tuple(head["axes"]), float(head["sample_period"])
-    except (ValueError, TypeError, KeyError, RecursionError) as error:
+    except (ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
         raise FileFormatError(path, f"has no head: damaged ({type(error).__name__}).") from None
     if axes != recording.names or period != recording.sample_period:
         raise FileFormatError(
@@ -230,7 +230,7 @@ def _stretches(rows: FloatArray) -> list[FloatArray]:
 
 
 def _beyond(rows: FloatArray, recording: Recording) -> FloatArray:
-    """Rows after the last one that is in the recording."""
+    """Rows after the last one that is in the recording; all of them where none is found in it."""
     axes = len(recording.axes)
     end = 0
     for experiment in recording.experiments:
@@ -239,7 +239,7 @@ def _beyond(rows: FloatArray, recording: Recording) -> FloatArray:
         for begin in np.flatnonzero(first).tolist():
             if np.array_equal(rows[begin : begin + n, 1 : 1 + axes], experiment.position):
                 end = max(end, begin + n)
-    return rows[end:] if end else rows[:0]
+    return rows[end:]
 
 
 def _numbered(name: str) -> Iterator[str]:

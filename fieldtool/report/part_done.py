@@ -62,8 +62,18 @@ def missing(material: Material) -> Section | None:
         return None
     return Section(
         "What is missing",
-        "This session did not come to its end." if words else "Not everything is there.",
+        _cut_short(material) if words else "Not everything is there.",
         (*([Words(tuple(words), "warning")] if words else []), Words(material.missing, "list")),
+    )
+
+
+def _cut_short(material: Material) -> str:
+    begun = material.events_of("session")
+    if len(begun) < 2:
+        return "This session did not come to its end."
+    return (
+        f"The session's last command, {begun[-1].get('command')} of {_clock(begun[-1])}, did not come "
+        "to its end; what is shown is from those before."
     )
 
 

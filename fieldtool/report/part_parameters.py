@@ -1,10 +1,15 @@
 """New controller parameters, and what later stages say of them where their files are there."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from math import isclose
 from typing import Any
 
+from fieldtool.design.tuning import Tuning
 from fieldtool.report.material import Material
 from fieldtool.report.section import Block, Section, Table, Words
+
+ROUNDED = 1e-2
+"""Relative difference that comes of what drives can hold."""
 
 
 def parameters(material: Material) -> Section | None:
@@ -12,10 +17,9 @@ def parameters(material: Material) -> Section | None:
     if material.tuning is None:
         return None
     blocks: list[Block] = []
-    noted = material.events_of("parameters")
-    rows = noted[-1].get("rows") if noted else None
-    if isinstance(rows, list) and rows:
-        table = tuple(_row(row) for row in rows if isinstance(row, Mapping))
+    rows = _rows(material)
+    if rows:
+        table = tuple(_row(row) for row in rows)
         columns = ("axis", "parameter", "before", "after", "unit", "read back")
         blocks.append(Table(columns, table))
     else:
@@ -27,6 +31,16 @@ def parameters(material: Material) -> Section | None:
                     for axis in material.tuning.axes
                     for name, value in axis.parameters.items()
                 ),
+            )
+        )
+    if _designed_since(material.tuning, rows):
+        blocks.append(
+            Words(
+                (
+                    "Other parameters than these were designed afterwards; tuning.yaml holds them, and "
+                    "they were not written. What follows is said of them:",
+                ),
+                "warning",
             )
         )
     blocks.append(
@@ -42,9 +56,36 @@ def parameters(material: Material) -> Section | None:
     return Section("Controller parameters", _state(material), tuple(blocks))
 
 
+def _rows(material: Material) -> list[Mapping[str, Any]]:
+    """Parameters of the last write that was done; of the last that was thought of where none was."""
+    noted, best = None, None
+    for event in material.events:
+        if event.get("event") == "parameters":
+            noted = event.get("rows")
+            best = noted if best is None else best
+        elif event.get("event") == "write" and event.get("written"):
+            best = noted
+    if not any(e.get("written") for e in material.events_of("write")):
+        best = noted
+    return [row for row in best if isinstance(row, Mapping)] if isinstance(best, list) else []
+
+
+def _designed_since(tuning: Tuning, rows: Sequence[Mapping[str, Any]]) -> bool:
+    """Whether the tuning has other values than were written, beyond what drives round."""
+    written = {(row.get("axis"), row.get("name")): row.get("after") for row in rows}
+    for axis in tuning.axes:
+        for name, value in axis.parameters.items():
+            other = written.get((axis.axis, name))
+            if isinstance(other, int | float) and not isclose(
+                other, value, rel_tol=ROUNDED, abs_tol=ROUNDED
+            ):
+                return True
+    return False
+
+
 def _state(material: Material) -> str:
-    written = material.events_of("write")
-    if not written or not written[-1].get("written"):
+    written = [event for event in material.events_of("write") if event.get("written")]
+    if not written:
         return "Designed; nothing was written into the drives."
     if written[-1].get("stored"):
         return "Written into the drives, read back, and stored in their non-volatile memory."

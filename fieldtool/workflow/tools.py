@@ -13,13 +13,16 @@ from fieldtool.errors import PlanRefusedError
 from fieldtool.workflow.session import Options, Screen, never, open_session, parameter_table
 from fieldtool.writeback.tool_sets import (
     ToolSet,
+    ToolSets,
     changes_to,
     keep_drives,
     keep_session,
     tool_set,
     tool_sets,
+    tools_folder,
 )
 from fieldtool.writeback.transaction import WriteBack, apply_changes
+from fieldtool.writeback.unfinished import refuse_unfinished
 
 
 @dataclass(frozen=True)
@@ -33,8 +36,8 @@ class Difference:
     other: Raw | None
 
 
-def tools_of(machine: str | Path | MachineProfile) -> tuple[ToolSet, ...]:
-    """Return the tool sets of a machine, by name."""
+def tools_of(machine: str | Path | MachineProfile) -> ToolSets:
+    """Return the tool sets of a machine, by name, and those that can not be used."""
     return tool_sets(_profile(machine).name)
 
 
@@ -46,13 +49,15 @@ def keep_tool(
     Raises
     ------
     DrivesError, FieldtoolError
-        If nothing was written from the session, or the drives can not be read.
+        If nothing was written from the session; the drives can not be read, or may hold what a write
+        or a measurement that was cut off has left in them.
     """
     profile = _profile(machine)
     controller = _controller(profile)
     if session is not None:
         return keep_session(profile.name, name, session, controller)
     with connect(profile, to_move=False) as group:
+        refuse_unfinished(profile.name, group.drives, tools_folder(profile.name) / name)
         return keep_drives(profile.name, name, group.drives, controller)
 
 

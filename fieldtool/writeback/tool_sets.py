@@ -13,8 +13,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from drives.canopen_drive import CanopenDrive
 from drives.errors import ProfileError
 from drives.objects import ObjectAddress
@@ -31,14 +29,18 @@ from drives.parameters import (
     load_journal,
     save_backup,
 )
-from drives.parameters.durable import write_durably
 from drives.parameters.journal import State
-from drives.profile import read_yaml
 from fieldtool.errors import OutputError
 from fieldtool.records.session_folder import SessionFolder
+from fieldtool.writeback.tool_file import (
+    ToolFile,
+    file_checksum,
+    read_tool_file,
+    trial_of,
+    write_tool_file,
+)
 from fieldtool.writeback.unfinished import state_folder
 
-FORMAT = "fieldtool-tool/1"
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,49}")
 
 
@@ -71,24 +73,38 @@ class ToolSet:
         }
 
 
+@dataclass(frozen=True)
+class ToolSets:
+    """What is kept of a machine."""
+
+    whole: tuple[ToolSet, ...]
+    bad: Mapping[str, str]
+    """Names of those that can not be used, and why."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values, as ``--json`` prints them."""
+        return {
+            "tools": [tool.as_dict() for tool in self.whole],
+            "bad": [{"name": name, "problem": problem} for name, problem in self.bad.items()],
+        }
+
+
 def tools_folder(machine: str) -> Path:
     """Return where the tool sets of a machine lie."""
     return state_folder("tools") / re.sub(r"[^A-Za-z0-9_.-]", "_", machine)
 
 
-def tool_sets(machine: str) -> tuple[ToolSet, ...]:
-    """Return all tool sets of a machine, by name.
-
-    Raises
-    ------
-    ProfileError
-        If one can not be read.
-    """
+def tool_sets(machine: str) -> ToolSets:
+    """Return all tool sets of a machine, by name; one that can not be read does not hide the others."""
     folder = tools_folder(machine)
-    if not folder.is_dir():
-        return ()
-    names = sorted(one.name for one in folder.iterdir() if (one / "tool.yaml").is_file())
-    return tuple(tool_set(machine, name) for name in names)
+    names = sorted(one.parent.name for one in folder.glob("*/tool.yaml"))
+    whole, bad = list[ToolSet](), dict[str, str]()
+    for name in names:
+        try:
+            whole.append(tool_set(machine, name))
+        except ProfileError as error:
+            bad[name] = str(error)
+    return ToolSets(tuple(whole), bad)
 
 
 def tool_set(machine: str, name: str) -> ToolSet:
@@ -108,25 +124,11 @@ def tool_set(machine: str, name: str) -> ToolSet:
         raise ProfileError(
             path, f"machine {machine} has no tool set {name!r}; {known} (`fieldtool tools keep`)"
         )
-    data, _ = read_yaml(path)
-    if data.get("format") != FORMAT:
-        raise ProfileError(path, f"format must be {FORMAT}, got {data.get('format')!r}", 1)
-    try:
-        return ToolSet(
-            name,
-            str(data["machine"]),
-            str(data["kept"]),
-            str(data["source"]),
-            data["verified"] is True,
-            {
-                str(axis): {str(k): None if v is None else float(v) for k, v in values.items()}
-                for axis, values in data["figures"].items()
-            },
-            load_backup(folder / "parameters.yaml"),
-            folder,
-        )
-    except (KeyError, TypeError, AttributeError, ValueError) as error:
-        raise ProfileError(path, f"is no tool set ({error})") from None
+    data = read_tool_file(path, name, machine)
+    parameters = load_backup(folder / "parameters.yaml")
+    return ToolSet(
+        name, machine, data.kept, data.source, data.verified, data.figures, parameters, folder
+    )
 
 
 def keep_session(
@@ -165,14 +167,15 @@ def keep_session(
     if journal.machine != machine:
         raise ProfileError(folder.journal, f"is of machine {journal.machine}, not of {machine}")
     before = load_backup(session / journal.backup)
+    entries = {record.axis: record.entries for record in journal.drives}
     parts = []
     for part in before.drives:
-        written = {entry.info: entry.after for entry in journal.drive(part.axis).entries}
+        written = {entry.info: entry.after for entry in entries.get(part.axis, ())}
         known = {held.info.address: held for held in part.held}
         now = known | {i.address: HeldObject(i, value) for i, value in written.items()}
         own = controller.get(part.axis, ())
         parts.append(replace(part, held=tuple(now[a] for a in own if a in now)))
-    verified, figures = _trial(folder, journal.drives)
+    verified, figures = trial_of(folder.verification, journal.drives)
     return _keep(machine, name, str(session), verified, figures, parts)
 
 
@@ -212,29 +215,6 @@ def changes_to(
     return tuple(changes)
 
 
-def _trial(
-    folder: SessionFolder, records: Sequence[Any]
-) -> tuple[bool, dict[str, dict[str, float | None]]]:
-    """Return whether what was written is what stood its trial, and what that measured."""
-    if not folder.verification.is_file():
-        return False, {}
-    data, _ = read_yaml(folder.verification)
-    tried = {(p["axis"], p["object"]): p["raw"] for p in data.get("parameters", ())}
-    written = {
-        (record.axis, str(entry.info.address)): entry.after
-        for record in records
-        for entry in record.entries
-    }
-    if data.get("verdict") != "verified" or tried != written:
-        return False, {}
-    names = ("settling_time", "overshoot", "sensitivity_peak")
-    return True, {
-        axis["axis"]: {name: axis["after"][name] for name in names}
-        for axis in data["axes"]
-        if axis["after"]
-    }
-
-
 def _keep(
     machine: str,
     name: str,
@@ -252,8 +232,8 @@ def _keep(
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "tool.yaml").unlink(missing_ok=True)  # never the old words about new values
         save_backup(parameters, folder / "parameters.yaml")
-        data = {"format": FORMAT, **tool.as_dict()}
-        write_durably(folder / "tool.yaml", yaml.safe_dump(data, sort_keys=False).encode())
+        beside = file_checksum(folder / "parameters.yaml")
+        write_tool_file(folder / "tool.yaml", ToolFile(**tool.as_dict(), parameters=beside))
     except OSError as error:
         raise OutputError(
             f"{folder}: the tool set can not be kept ({error.strerror or error}). Make room, or name "

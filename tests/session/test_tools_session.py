@@ -1,14 +1,19 @@
 """Tool sets: kept from what was tried, compared, switched by the same all-or-nothing write."""
 
 import json
+import shutil
+import signal
 
 import pytest
 import yaml
 
+from drives.canopen_drive import connect
+from drives.parameters import Transaction
 from drives.profile import load_machine
 from drives.sim.faults import SdoRefused
 from fieldtool.records.model_file import write_model
 from fieldtool.workflow.models import truth_model
+from fieldtool.writeback.temporary import backed_up
 from fieldtool.writeback.tool_sets import tools_folder
 from tests.session.test_verification_session import GOOD, write_tuning
 
@@ -158,3 +163,158 @@ def test_a_session_whose_write_was_restored_is_no_tool_set(session):
     outcome = tools(session, "keep", "gripper", "--from", session.out)
     assert outcome.code == 2
     assert "did not end with its parameters in the drives" in outcome.err
+
+
+# --- files that were changed, or are none --------------------------------------------------------
+
+
+def tool_file(name):
+    return tools_folder("bench") / name / "tool.yaml"
+
+
+@pytest.mark.usefixtures("untried")
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("verified: false", "verified: true"),
+        ("machine: bench", "machine: other"),
+        ("name: bare", "name: gripper"),
+        ("source: drives", "source: elsewhere"),
+    ],
+)
+def test_words_about_a_set_that_were_changed_are_not_believed(session, tmp_path, old, new):
+    tools(session, "keep", "bare")
+    text = tool_file("bare").read_text()
+    assert old in text
+    tool_file("bare").write_text(text.replace(old, new))
+    outcome = tools(session, "switch", "bare", "--yes", "--store", "--out", tmp_path / "one")
+    assert outcome.code == 2, outcome.err
+    assert "checksum" in outcome.err
+    assert session.stored() == {TABLE: {}, ARM: {}}
+
+
+@pytest.mark.usefixtures("untried")
+@pytest.mark.parametrize("what", ["parameters", "both"])
+def test_another_sets_files_under_this_name_are_refused(session, tmp_path, what):
+    tools(session, "keep", "bare")
+    session.command("write", session.out, "--yes")
+    tools(session, "keep", "gripper", "--from", session.out)
+    written = session.changed()
+    for name in ("parameters.yaml", "tool.yaml")[: 1 if what == "parameters" else 2]:
+        shutil.copy(tool_file("bare").with_name(name), tool_file("gripper").with_name(name))
+    outcome = tools(session, "switch", "gripper", "--yes", "--out", tmp_path / "one")
+    assert outcome.code == 2, outcome.err
+    assert session.changed() == written
+
+
+@pytest.mark.usefixtures("untried")
+def test_bad_sets_are_listed_as_bad_and_do_not_hide_the_others(session):
+    tools(session, "keep", "good")
+    tools(session, "keep", "bad")
+    tool_file("bad").write_text("[]")
+    odd = tool_file("bad").parent.with_name("we ird")
+    odd.mkdir()
+    shutil.copy(tool_file("good"), odd / "tool.yaml")
+    listed = tools(session, "list")
+    assert listed.code == 0, listed.err
+    assert "good" in listed.out
+    assert "we ird: can not be used" in " ".join(listed.out.split())
+    found = json.loads(tools(session, "list", "--json").out)
+    assert [t["name"] for t in found["tools"]] == ["good"]
+    assert [t["name"] for t in found["bad"]] == ["bad", "we ird"]
+
+
+@pytest.mark.usefixtures("untried")
+@pytest.mark.parametrize(
+    "figures",
+    ["{a: 3}", "{a: {b: .nan}}", "[]", "null", "{1: {b: 2}}", "{a: {b: 1" + "0" * 400 + "}}"],
+)
+def test_figures_that_are_none_are_one_sentence(session, figures):
+    tools(session, "keep", "bare")
+    path = tool_file("bare")
+    path.write_text(path.read_text().replace("figures: {}", f"figures: {figures}"))
+    found = json.loads(tools(session, "list", "--json").out)
+    assert found["tools"] == []
+    assert "figures" in found["bad"][0]["problem"]
+    outcome = tools(session, "compare", "bare", "bare")
+    assert outcome.code == 2
+    assert len(outcome.err) < 1000
+
+
+VERIFIED = "format: fieldtool-verification/1\nverdict: verified\nmodel: identified\nbound: 2\n"
+
+
+@pytest.mark.usefixtures("untried")
+@pytest.mark.parametrize(
+    "text",
+    [
+        "[]",
+        "null",
+        VERIFIED + "parameters: null\naxes: []\n",
+        VERIFIED + "parameters: 3\naxes: []\n",
+        VERIFIED + "parameters: [1]\naxes: []\n",
+        VERIFIED + "parameters:\n- {axis: table}\naxes: []\n",
+        VERIFIED + "parameters: []\n",
+        VERIFIED + "parameters: []\naxes: [{axis: table, after: {settling_time: .inf}}]\n",
+        VERIFIED.replace("2", ".nan") + "parameters: []\naxes: []\n",
+    ],
+)
+def test_a_verification_that_is_none_is_one_sentence(session, text):
+    session.command("write", session.out, "--yes")
+    (session.out / "verification.yaml").write_text(text)
+    outcome = tools(session, "keep", "gripper", "--from", session.out)
+    assert outcome.code == 2, outcome.err
+    assert "verification.yaml" in outcome.err
+    assert len(outcome.err) < 1000
+
+
+@pytest.mark.usefixtures("untried")
+@pytest.mark.parametrize(
+    ("was", "now", "verified"),
+    [("", "", True), ("bound: 2", "bound: 2.5", False), ("identified", "prior", False)],
+)
+def test_what_may_not_be_stored_is_not_kept_as_verified(session, was, now, verified):
+    session.command("write", session.out, "--yes")
+    journal = yaml.safe_load((session.out / "write-journal.yaml").read_text())
+    tried = [
+        {"axis": drive["axis"], "object": p["object"], "raw": p["after"]}
+        for drive in journal["drives"]
+        for p in drive["parameters"]
+    ]
+    text = VERIFIED.replace(was, now) + yaml.safe_dump({"parameters": tried, "axes": []})
+    (session.out / "verification.yaml").write_text(text)
+    kept = tools(session, "keep", "gripper", "--from", session.out, "--json")
+    assert json.loads(kept.out)["verified"] is verified
+
+
+@pytest.mark.usefixtures("untried")
+def test_what_a_measurement_that_was_cut_off_left_in_the_drives_is_no_tool_set(session):
+    with connect(load_machine(session.profile)) as group:
+        held = backed_up("bench", group.drives, session.out / "parameters-before.yaml")
+        held.__enter__()  # and never ended, as of a process that was killed
+        held.gen.gi_frame.f_locals["keeper"].__exit__()
+    outcome = tools(session, "keep", "bare")
+    assert outcome.code == 3, outcome.err
+    assert "fieldtool restore" in outcome.err
+    assert not tool_file("bare").exists()
+
+
+@pytest.mark.usefixtures("untried")
+def test_a_stop_while_a_set_is_written_takes_it_back(session, tmp_path, monkeypatch):
+    """Also right after the tool has asked for one."""
+    heed = Transaction._heed_stop
+
+    def pressed(one):
+        assert not one._stop_requested()
+        signal.raise_signal(signal.SIGINT)
+        heed(one)
+
+    tools(session, "keep", "bare")
+    session.command("write", session.out, "--yes")
+    written = session.changed()
+    monkeypatch.setattr(Transaction, "_heed_stop", pressed)
+    outcome = tools(session, "switch", "bare", "--yes", "--out", tmp_path / "one")
+    assert outcome.code == 130, outcome.err
+    assert "what was written is taken back" in outcome.err
+    assert "All drives hold the old values" in outcome.err
+    assert session.changed() == written

@@ -228,6 +228,7 @@ def test_an_axis_that_oscillates_already_is_said_and_nothing_is_written(make_ben
 def test_nobody_is_asked_to_move_means_nothing_moves(session):
     session.listen()
     outcome = session.command("write", session.out)
+    assert outcome.code == 3
     assert "nobody to ask" in " ".join((outcome.out + outcome.err).split())
     assert not [f for f in session.heard() if f.cob_id == 0x80], "no SYNC: nothing moved"
     assert session.changed() == {}

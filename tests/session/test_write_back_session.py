@@ -123,7 +123,7 @@ def test_a_whole_run_with_write_changes_the_parameters_and_nothing_else(small_be
 
 def test_nobody_to_ask_means_nothing_is_written(session):
     outcome = session.command("write", session.out)
-    assert outcome.code == 0
+    assert outcome.code == 3
     assert "nobody to ask" in outcome.out + outcome.err
     assert "Nothing was written" in outcome.out + outcome.err
     assert session.changed() == {}

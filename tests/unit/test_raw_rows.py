@@ -2,7 +2,9 @@
 
 import os
 import signal
+import struct
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -69,6 +71,33 @@ def test_what_the_recording_has_already_is_not_added_twice(path, fresh_rng):
     assert np.array_equal(left.position, block.position[60:])
     both = Recording(STEP, AXES, (first, experiment("last", block, slice(60, 100))))
     assert cut_off_rows(path, both) == ()
+
+
+def test_rows_that_are_not_found_in_the_recording_are_kept(path, fresh_rng):
+    """Twice is better than never: the file is removed once they are in the recording."""
+    rows = RawRows(path, ("a", "b"))
+    rows.begin(STEP)
+    known, other = capture(fresh_rng, 0, 40), capture(fresh_rng, 100, 30)
+    rows.take(known)
+    rows.kept()
+    rows.take(other)  # a stretch of its own, of which nothing was kept
+    rows.close(all_kept=False)
+    (left,) = cut_off_rows(path, Recording(STEP, AXES, (experiment("first", known),)))
+    assert np.array_equal(left.position, other.position)
+    altered = np.nextafter(known.position, np.inf)
+    first = replace(experiment("first", known), position=altered)
+    both = cut_off_rows(path, Recording(STEP, AXES, (first,)))
+    assert [one.samples for one in both] == [40, 30]
+    assert np.array_equal(both[0].position, known.position)
+
+
+@pytest.mark.parametrize("period", ["1" + 400 * "0", "null", "[]", "NaN", '"x"', "1" + 5000 * "0"])
+def test_a_head_without_a_period_is_refused_in_words(path, period):
+    head = f'{{"axes": ["a", "b"], "sample_period": {period}}}'.encode()
+    path.write_bytes(struct.pack("<4sI", b"HEAD", len(head)) + head)
+    with pytest.raises(FileFormatError, match=r"has no head|every nan s") as error:
+        cut_off_rows(path, EMPTY)
+    assert len(str(error.value)) < 1000
 
 
 def test_where_all_was_kept_no_file_is_left(path, fresh_rng):

@@ -20,13 +20,16 @@ from fieldtool.criticise.criticise import criticise
 from fieldtool.criticise.criticism_file import read_criticism
 from fieldtool.criticise.pictured import pictures_of
 from fieldtool.criticise.pictures_file import load_pictures, save_pictures
+from fieldtool.design.tuning import AxisTuning, Tuning
 from fieldtool.errors import FileFormatError
 from fieldtool.records.model import Estimate
 from fieldtool.records.model_file import write_model
 from fieldtool.records.recording import save
 from fieldtool.records.session_folder import SessionFolder
 from fieldtool.records.yaml_file import write_yaml
+from fieldtool.report.material import Material
 from fieldtool.report.page import Page, html_of
+from fieldtool.report.part_parameters import parameters
 from fieldtool.report.section import Plot, Section, Table, Words
 from fieldtool.workflow.reporting import material_of, report
 from tests.unit.late_axis import FINE, MODEL, STEP, recorded
@@ -299,3 +302,25 @@ def test_numbers_of_unknown_error_are_said_to_be_unknown(session, tmp_path):
     )
     write_model(replace(found.criticism.model, axes=axes), Path(part / "model.yaml"))
     assert "± not known" in report(part).read_text(encoding="utf-8")
+
+
+def test_what_was_written_is_told_from_what_was_designed_or_tried_later():
+    tuning = Tuning((AxisTuning("table", {"velocity_p": 4.2}, 1.5, "the design of today."),))
+    written = {"axis": "table", "name": "velocity_p", "before": 1.0, "after": 3.1, "unit": "1"}
+    later = [
+        {"event": "session", "command": "run"},
+        {"event": "parameters", "rows": [written]},
+        {"event": "write", "written": True},
+        {"event": "session", "command": "write"},
+        {"event": "parameters", "rows": [{**written, "after": 4.2}]},
+        {"event": "write", "written": False},
+    ]
+    section = parameters(Material("x", tuning=tuning, events=tuple(later)))
+    table, warning, _ = section.blocks
+    assert table.rows[0][3] == "3.1"
+    assert "were not written" in warning.sentences[0]
+    assert section.lead.startswith("Written into the drives")
+    section = parameters(Material("x", tuning=tuning, events=tuple(later[3:])))
+    table, _ = section.blocks
+    assert table.rows[0][3] == "4.2"
+    assert "nothing was written" in section.lead
