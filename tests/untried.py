@@ -24,6 +24,9 @@ class Stood:
     def prove(self) -> None:
         """Find nothing wrong."""
 
+    def ended(self, _error: BaseException | None) -> None:
+        """Keep nothing."""
+
 
 def untried() -> None:
     """Let writes in this process go untried from now on."""
