@@ -194,7 +194,7 @@ class FastMeasurement:
             return run_multisine(self._group, plan, self._axes, noting, report, errors)
         except StoppedError as error:
             done = sum(one.complete for one in begun)
-            following = plan.experiments[min(done, len(plan.experiments) - 1)].name
+            following = plan.experiments[done].name if done < len(plan.experiments) else ""
             judge_stop(error, begun, following, self._axes, plan.cycle_time, keep)
             raise
 

@@ -25,7 +25,7 @@ LAGS = (0.02, 0.05, 0.12, 0.3, 0.75)
 AT_LIMIT = 0.9
 """Of a limit: excitation is planned to stay well below."""
 LAST = 0.5
-"""Seconds before the stop, in which a limit was reached; of a swing that does not die out."""
+"""Seconds before the stop, in which a limit was reached; the shortest record of a swing."""
 SWINGS = 2
 """Periods of it in that time, at least."""
 ONE_FREQUENCY = 0.8
@@ -51,7 +51,7 @@ def judge_stop(
     kept
         Experiments that were kept already.
     following
-        Name of the experiment that was to come, if it was between two.
+        Name of the experiment that was to come, if it was before one; empty after the last.
     axes
         Names and limits.
     step
@@ -109,7 +109,7 @@ def check_loops(setting: Setting) -> None:
 
 def _way(capture: Capture, following: str, step: float, note: str) -> Experiment:
     return Experiment(
-        name=f"way to {following}",
+        name=f"way to {following}" if following else "rest at the end",
         kind="other",
         driven=(),
         free=(),
@@ -146,15 +146,16 @@ def _unstable(
         return None
     frequency = _grown(error, capture.torque, errors, torques, step)
     if frequency is None and within is None:
-        frequency = _swinging(shares[last], step)
+        frequency = _swings_standing(shares, step)
     if frequency is None:
         return None
     nearest = int(np.argmax(np.abs(shares[last]).max(axis=0)))
     name = axes.names[nearest % len(axes.names)]
+    between = f"before experiment {following}" if following else "after the last experiment"
     where = (
         f"in experiment {within}"
         if within
-        else f"before experiment {following}, while all axes were told to stand still,"
+        else f"{between}, while all axes were told to stand still,"
     )
     return LoopUnstableError(
         f"{name}: its loop becomes unstable: {where} an oscillation at {frequency:.3g} Hz grew by "
@@ -175,6 +176,16 @@ def _grown(
         if growth is not None:
             return growth.frequency
     return None
+
+
+def _swings_standing(shares: FloatArray, step: float) -> float | None:
+    """Look at the last LAST seconds, and at twice as many until the whole record was seen."""
+    rows = max(2, round(LAST / step))
+    while True:
+        frequency = _swinging(shares[-rows:], step)
+        if frequency is not None or rows >= len(shares):
+            return frequency
+        rows *= 2
 
 
 def _swinging(shares: FloatArray, step: float) -> float | None:

@@ -16,6 +16,7 @@ from drives.sim.firmware import Parameter
 from drives.sim.lockstep_bus import register, unregister
 from drives.sim.machine import simulated_machine
 from fieldtool import workflow
+from fieldtool.experiment import axes
 from fieldtool.records.csv_folder import write_folder
 from fieldtool.records.recording import load, save
 from fieldtool.workflow import fast_measuring, planning
@@ -343,14 +344,18 @@ def unstable_with_the_true_end_mass(position_p=35, velocity_i=16):
 
 
 @pytest.mark.parametrize(
-    ("gains", "how"),
+    ("gains", "wait", "how"),
     [
-        ((35, 16), "unstable: by what the pilot has shown"),  # too slow for the pilot's 2 s
-        ((60, 30), "becomes unstable: in experiment pilot 1"),
+        ((35, 16), 0.5, "unstable: by what the pilot has shown"),  # too slow for 2 s and the wait
+        ((35, 16), 20.0, "becomes unstable: after the last experiment"),
+        ((60, 30), 20.0, "becomes unstable: in experiment pilot 1"),
     ],
 )
-def test_a_loop_that_is_unstable_with_the_true_end_mass_only(make_bench, monkeypatch, gains, how):
+def test_a_loop_that_is_unstable_with_the_true_end_mass_only(
+    make_bench, monkeypatch, gains, wait, how
+):
     """Directions are not checked here: the pilot is the first that moves."""
+    monkeypatch.setattr(axes, "STILL_TIMEOUT", wait)
     monkeypatch.setattr(fast_measuring, "check_directions", lambda *_: None)
     bench = make_bench(unstable_with_the_true_end_mass(*gains))
     outcome = bench.command("measure", bench.profile, "--out", bench.out)

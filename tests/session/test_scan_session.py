@@ -108,7 +108,7 @@ def test_the_skeleton_moves_nothing_until_a_person_has_completed_it(bench) -> No
     assert "2 axes, 16 places to fill in" in words(outcome.out)
     text = path.read_text(encoding="utf-8")
     assert text.count('"FILL IN"') == 16
-    with pytest.raises(ProfileError, match=r"found\.yaml:1\d: axes\.0\.kind"):
+    with pytest.raises(ProfileError, match=r"found\.yaml:1\d: axis axis1, kind"):
         load_machine(path)
     assert bench.command("run", path).code == 2
 
