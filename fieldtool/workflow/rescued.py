@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 from drives.canopen_drive import CanopenGroup
 from fieldtool.errors import OutputError
@@ -21,7 +22,7 @@ def keeping(
 
     The file beside the recording is removed at the end, unless the recording could not be written.
     """
-    rows = RawRows(folder.raw_rows, group.axes)
+    rows = RawRows(_rows_of(recording.path), group.axes)
     lacking = False
 
     def keep(experiment: Experiment) -> None:
@@ -42,8 +43,13 @@ def keeping(
         rows.close(all_kept=not lacking)
 
 
+def _rows_of(recording: Path) -> Path:
+    """Return the file beside a recording for what is not in it yet: as ``SessionFolder.raw_rows``."""
+    return recording.with_name(f"{recording.stem}-cut-off.rows")
+
+
 def rescue(folder: SessionFolder, say: Callable[[str], None] = lambda _: None) -> None:
-    """Put what a killed session had measured of an experiment into its recording.
+    """Put what a killed session had measured of an experiment into its recording: of a trial too.
 
     Nothing is done where there is no such thing, or the session is still at work.
 
@@ -54,18 +60,22 @@ def rescue(folder: SessionFolder, say: Callable[[str], None] = lambda _: None) -
     OutputError
         If the recording can not be written.
     """
-    if not folder.raw_rows.is_file() or not folder.recording.is_file() or is_at_work(folder.path):
-        return
-    recording = load(folder.recording)
-    found = cut_off_rows(folder.raw_rows, recording)
+    for path in (folder.recording, *sorted(folder.path.glob("verification*.h5"))):
+        if _rows_of(path).is_file() and path.is_file() and not is_at_work(folder.path):
+            _rescue(folder, path, say)
+
+
+def _rescue(folder: SessionFolder, path: Path, say: Callable[[str], None]) -> None:
+    recording = load(path)
+    found = cut_off_rows(_rows_of(path), recording)
     if found:
-        with RecordingWriter(folder.recording, recording) as writer:
+        with RecordingWriter(path, recording) as writer:
             for experiment in found:
                 writer.append(experiment)
         rows = sum(experiment.samples for experiment in found)
         folder.note("rescued", rows=rows)
         say(
             f"The session had been cut off while the axes moved: {rows} rows of that motion are in "
-            f"{folder.recording.name} now, as {', '.join(one.name for one in found)}."
+            f"{path.name} now, as {', '.join(one.name for one in found)}."
         )
-    folder.raw_rows.unlink(missing_ok=True)
+    _rows_of(path).unlink(missing_ok=True)

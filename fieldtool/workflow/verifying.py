@@ -49,6 +49,7 @@ from fieldtool.report.verification_picture import (
     same_times,
 )
 from fieldtool.workflow.preparation import axes_of, recording_header, setting_of
+from fieldtool.workflow.rescued import keeping
 from fieldtool.workflow.session import Session
 from fieldtool.workflow.trial_plan import (
     TrialPlan,
@@ -298,7 +299,7 @@ class Verification:
 
     @contextmanager
     def _recording(self) -> Iterator[Callable[[Experiment], None]]:
-        """Give what keeps raw data, in one file for both trials."""
+        """Give what keeps raw data, in one file for both trials; rows are saved while axes move."""
         if self._recorder is None:
             header = recording_header(
                 self._session.machine,
@@ -309,7 +310,8 @@ class Verification:
             path = _free(self._session.folder.path / "verification.h5")
             self._recorder = RecordingWriter(path, header)
         try:
-            yield self._recorder.append
+            with keeping(self._session.folder, self._recorder, self._group) as keep:
+                yield keep
         except BaseException:
             self._close()
             raise

@@ -1,7 +1,7 @@
 """The trial of loops through the bus, and its watch: an oscillation is stopped within 50 ms."""
 
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -167,6 +167,28 @@ def test_an_oscillation_that_starts_is_stopped_within_50_ms(bench, how, after):
     assert not kept[-1].complete
     assert kept[-1].note
     assert all(e.complete for e in kept[:-1])
+
+
+@pytest.mark.parametrize("factor", [0.1, 0.15, 0.2])
+def test_a_loop_that_swings_slowly_goes_little_beyond_what_is_foreseen(bench, factor):
+    """A velocity loop that is too soft swings at some 4 Hz, as slowly as the quick move itself turns."""
+    quick = replace(
+        move(0, 0.8, 0.45, [5.8, 5.8]), half_period=0.06, swings=(0.6, 0.02), astray=0.05
+    )
+    one = Trial(STEP, (quick,), None, np.zeros(2), np.zeros(2))
+    observer, kept = Observer(bench), []
+    fault = Gains(TABLE, factor, (Parameter.VELOCITY_P,))
+    bench.inject(fault, sync=bench.machine.sync_count + 2500)
+    with bench.connected(lambda: False) as group, pytest.raises(OscillationError) as stopped:
+        run_trial(group, one, axes_of(group), kept.append, "after", trusts_loops=False)
+    assert stopped.value.axis == "table"
+    bench.machine.lift(fault)
+    assert bench.powered() == {}
+    (made,) = kept
+    ways = np.sign(quick.distance) * (made.position[:, 0] - made.position_reference[0, 0])
+    print("X", factor, ways.min(), ways.max(), observer.off_at(), made.samples, stopped.value)
+    assert -0.15 < ways.min()
+    assert ways.max() < 0.8 + 0.15
 
 
 @pytest.mark.parametrize("after", [1, IN_HOLD, IN_NUDGE, IN_MOVE])

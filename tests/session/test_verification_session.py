@@ -1,7 +1,9 @@
 """New parameters through the bus: tried on the machine, kept or taken back, and told."""
 
 import json
+import os
 import signal
+import time
 from contextlib import nullcontext
 
 import numpy as np
@@ -9,14 +11,16 @@ import pytest
 import yaml
 
 from drives.profile import load_machine
-from drives.sim.faults import EncoderStuck, MotorReversed
+from drives.sim.faults import EncoderStuck, Fault, MotorReversed
 from drives.sim.firmware import Parameter
 from fieldtool.design.loops import Loops
 from fieldtool.design.machine import machine_of, respond
 from fieldtool.design.servo import Timing, servo_from_parameters
 from fieldtool.records.model_file import write_model
 from fieldtool.records.recording import load
+from fieldtool.records.session_folder import SessionFolder
 from fieldtool.workflow.models import truth_model
+from fieldtool.workflow.rescued import rescue
 from tests.session.conftest import GAINS
 from tests.session.test_trial import Gains
 
@@ -367,6 +371,45 @@ def test_verified_is_on_the_disk_only_if_the_drives_hold_the_new_values(
         assert page.code == 0, page.err
         text = (session.out / "report.html").read_text()
         assert "stood their trial" not in text
+
+
+class Killed(Fault):
+    """Ends this whole program, as a power cut of its computer does."""
+
+    def set(self, machine, *, present):
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs a process that can be killed")
+def test_what_axes_did_in_a_trial_outlives_a_kill(session):
+    """It is rescued into the trial's own file, and not into the measurement."""
+    session.inject(Killed(TABLE), sync=session.machine.sync_count + 5200)
+    child = os.fork()
+    if child == 0:
+        try:
+            write(session)
+        finally:
+            os._exit(1)
+    _, status = os.waitpid(child, 0)
+    assert os.WIFSIGNALED(status)
+    assert os.WTERMSIG(status) == signal.SIGKILL
+    path, rows = session.out / "verification.h5", session.out / "verification-cut-off.rows"
+    assert load(path).experiments == ()
+    deadline, size = time.monotonic() + 10.0, -1
+    while rows.stat().st_size != size:  # another process copies what the killed one left
+        size = rows.stat().st_size
+        assert time.monotonic() < deadline
+        time.sleep(0.3)
+    said = []
+    rescue(SessionFolder(session.out), said.append)
+    assert len(said) == 1
+    assert "verification.h5" in said[0]
+    found = load(path).experiments
+    assert sum(one.samples for one in found) > 4000
+    assert not any(one.complete for one in found)
+    assert np.ptp(found[-1].position_reference[:, 0]) > 0.3, "it was killed in the table's move"
+    assert not rows.exists()
+    assert not (session.out / "recording.h5").exists()
 
 
 def with_bound(session, bound):
