@@ -176,8 +176,7 @@ def test_a_loop_that_swings_slowly_goes_little_beyond_what_is_foreseen(bench, fa
         move(0, 0.8, 0.45, [5.8, 5.8]), half_period=0.06, swings=(0.6, 0.02), astray=0.05
     )
     one = Trial(STEP, (quick,), None, np.zeros(2), np.zeros(2))
-    observer, kept = Observer(bench), []
-    fault = Gains(TABLE, factor, (Parameter.VELOCITY_P,))
+    kept, fault = [], Gains(TABLE, factor, (Parameter.VELOCITY_P,))
     bench.inject(fault, sync=bench.machine.sync_count + 2500)
     with bench.connected(lambda: False) as group, pytest.raises(OscillationError) as stopped:
         run_trial(group, one, axes_of(group), kept.append, "after", trusts_loops=False)
@@ -186,8 +185,7 @@ def test_a_loop_that_swings_slowly_goes_little_beyond_what_is_foreseen(bench, fa
     assert bench.powered() == {}
     (made,) = kept
     ways = np.sign(quick.distance) * (made.position[:, 0] - made.position_reference[0, 0])
-    print("X", factor, ways.min(), ways.max(), observer.off_at(), made.samples, stopped.value)
-    assert -0.15 < ways.min()
+    assert ways.min() > -0.15
     assert ways.max() < 0.8 + 0.15
 
 
