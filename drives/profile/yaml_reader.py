@@ -85,7 +85,15 @@ def _refuse_aliases(text: str, path: Path) -> None:
 def _note_lines(node: yaml.Node, place: tuple[str | int, ...], lines: Lines, path: Path) -> None:
     lines.setdefault(place, node.start_mark.line + 1)
     if isinstance(node, yaml.MappingNode):
+        before = ""
         for key, value in node.value:
+            if before.isdigit() and str(key.value)[:1].isdigit() and value.value == "":
+                raise ProfileError(
+                    path,
+                    f"a number is written with a point, not with a comma: {before}.{key.value}",
+                    key.start_mark.line + 1,
+                )
+            before = str(value.value)
             here = (*place, str(key.value))
             if here in lines:
                 raise ProfileError(

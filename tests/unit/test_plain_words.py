@@ -30,6 +30,7 @@ PROGRAMMERS = (
         ("springs: [190]", "springs: 190", 17, "axis table, prior.springs: a list in brackets"),
         ("springs: [190]", "springs: [190,5]", 15, "written with a point, not with a comma"),
         ("[0.02, 0.025]", "['0,02', 0.025]", 16, "number 1: a number is written with a point: 0.02"),
+        ("bus: {", "bus: {bitrate: 0,06, ", 3, "with a point, not with a comma: 0.06"),
         ("velocity: 10 rad", "velocity: 10,5 rad", 11, "write the number with a point: 10.5 rad/s"),
         ("    kind: rotary", "\tkind: rotary", 6, "begins with a tab: indent with blanks"),
         ("node_id: 11", "node_id: eleven", 7, "axis table, node_id: a whole number belongs here"),
