@@ -46,11 +46,21 @@ class TemporaryObjects:
         self._before: list[tuple[ObjectInfo, float, bool]] = []
 
     def change(self, info: ObjectInfo, value: float, before: float | None = None) -> None:
-        """Write a value, remembering the one before (read now, unless given)."""
+        """Write a value, remembering the one before (read now, unless given).
+
+        What is to be written back later is read twice: a wrong answer must not become a parameter.
+        """
         if before is None:
             before = self._drive.read_number(info)
         if before == value:
             return
+        again = self._drive.read_number(info)
+        if again != before:
+            raise NotSupportedError(
+                f"{self._drive.axis}, object {info.address} ({info.name}): read as {before}, then as "
+                f"{again}. It changes by itself, or answers come wrong: it was not changed. Check the "
+                "bus, and that nobody else writes to the drive."
+            )
         self.note(info, before)
         self._drive.write(info, value)
         found = self._drive.read_number(info)

@@ -1,0 +1,44 @@
+"""What is changed for a while: a wrong reading must not be written back as a parameter."""
+
+import pytest
+
+from drives.canopen_drive.setup import TemporaryObjects
+from drives.errors import NotSupportedError
+from drives.objects import ObjectAddress, ObjectInfo
+
+INFO = ObjectInfo(ObjectAddress(0x2010, 5), "UNSIGNED32", "inertia_ff")
+
+
+class Drive:
+    """Holds a number, and answers the readings that are listed wrongly."""
+
+    axis = "x"
+
+    def __init__(self, value, wrong):
+        self.value, self.wrong, self.readings = value, wrong, 0
+
+    def read_number(self, info):
+        self.readings += 1
+        return self.wrong.get(self.readings, self.value)
+
+    def write(self, info, value):
+        self.value = value
+
+
+@pytest.mark.parametrize("wrong", [{1: 3916780366}, {2: 3916780366}])
+def test_two_readings_that_differ_are_not_acted_on(wrong):
+    drive = Drive(7, wrong)
+    changes = TemporaryObjects(drive)
+    with pytest.raises(NotSupportedError, match=r"x, object 0x2010:05 .*was not changed"):
+        changes.change(INFO, 0)
+    assert changes.put_back() == []
+    assert drive.value == 7
+
+
+def test_a_value_is_changed_and_put_back():
+    drive = Drive(7, {})
+    changes = TemporaryObjects(drive)
+    changes.change(INFO, 0)
+    assert drive.value == 0
+    assert changes.put_back() == []
+    assert drive.value == 7
