@@ -279,9 +279,7 @@ def test_recordings(folder, data):
         path.write_bytes(whole)
         with h5py.File(path, "r+") as root:
             for _ in range(data.draw(st.integers(1, 2))):
-                with suppress(
-                    IndexError, MemoryError, TypeError, ValueError, OSError
-                ):  # spoiled already
+                with suppress(IndexError, MemoryError, TypeError, ValueError, OSError):
                     _spoil(data.draw, root)
     else:
         path.write_bytes(noisy(data.draw, whole))
