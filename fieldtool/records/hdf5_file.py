@@ -91,14 +91,14 @@ class Reader:
     def text(self, name: str, default: str | None = None) -> str:
         """Return the text attribute ``name``."""
         value = self._attribute(name, default)
-        if not isinstance(value, str):
+        if not _is_text(value):
             raise self.fault(f"the attribute '{name}' is no text.")
-        return value
+        return str(value)
 
     def texts(self, name: str) -> tuple[str, ...]:
         """Return the attribute ``name``, a list of texts."""
         value = np.atleast_1d(self._attribute(name))
-        if value.size and not all(isinstance(item, str) for item in value):
+        if not all(_is_text(item) for item in value):
             raise self.fault(f"the attribute '{name}' is no list of texts.")
         return tuple(str(item) for item in value)
 
@@ -119,6 +119,11 @@ class Reader:
             raise self.fault(f"the attribute '{name}' is missing; the file is damaged or of "
                              "another program.")  # fmt: skip
         return value
+
+
+def _is_text(value: object) -> bool:
+    """Whether it is text, and all of it can be written again: h5py reads other bytes as surrogates."""
+    return isinstance(value, str) and not any("\ud800" <= c <= "\udfff" for c in value)
 
 
 @contextmanager

@@ -261,6 +261,12 @@ def test_a_file_of_another_kind_is_refused(tmp_path: Path) -> None:
             lambda f: _replace(f["experiments/0000"], "time", np.array([b"a", b"b"])),
             "'time' holds",
         ),
+        (
+            lambda f: f["experiments/0000"].attrs.create(
+                "note", b"\xff", dtype=h5py.string_dtype()
+            ),
+            "'note' is no text",
+        ),
         (lambda f: f["experiments/0000"].attrs.modify("kind", "dance"), "kind must be one of"),
     ],
 )
