@@ -19,21 +19,18 @@ from fieldtool.experiment.forecast import Setting
 from fieldtool.experiment.multisine.design import SHARE_OF_LIMITS
 from fieldtool.experiment.multisine.forecast import forecast_multisine, scaled_to_limits
 from fieldtool.experiment.multisine.plan import MultisinePlan
-from fieldtool.experiment.stepped.design import undamped_modes
 from fieldtool.identify.likelihood.expected import Noise, expected_accuracy
-from fieldtool.identify.multisine.pilot import read_pilot
 from fieldtool.records.model import MachineModel
 from fieldtool.records.model_file import read_model, write_model
 from fieldtool.records.recording import Recording, load, save
 from fieldtool.records.session_folder import SessionFolder
 from fieldtool.workflow.criticising import alike, keep
 from fieldtool.workflow.fast_measuring import SEED, FastMeasurement
-from fieldtool.workflow.models import check_torque_scale, prior_model
+from fieldtool.workflow.models import prior_model
 from fieldtool.workflow.planning import PlannedFast, Wanted, excitations, plan_main, plan_pilot
 from fieldtool.workflow.proposals import Ground, Proposal, expected_data, proposals
 from fieldtool.workflow.reporting import report
 from fieldtool.workflow.session import Options, Screen, Session, never, open_session
-from fieldtool.workflow.stopped import check_loops
 from fieldtool.writeback.temporary import backed_up
 
 SAME_CYCLE = 1e-9
@@ -292,14 +289,7 @@ class _Distinguishing(FastMeasurement):
         session, chosen = self._session, self._chosen
         if chosen is None:
             raise PlanRefusedError("nothing was planned")
-        found = read_pilot(recording, self._setting.model)
-        check_torque_scale(found.torque_ratio, self._setting.model)
-        for note in found.notes:
-            session.warn(note)
-        modes = ", ".join(f"{w / (2 * np.pi):.2f}" for w in undamped_modes(found.model)[0])
-        session.screen.say(f"Resonances found: {modes} Hz." if modes else "The axes are rigid.")
-        known = replace(self._setting, model=found.model)
-        check_loops(known)
+        found, known = self._read(recording)
         try:
             forecast_multisine(chosen, known)
         except PlanRefusedError:

@@ -18,7 +18,7 @@ from fieldtool.experiment.multisine.plan import MultisinePlan
 from fieldtool.experiment.multisine.runner import run_multisine
 from fieldtool.experiment.stepped.design import undamped_modes
 from fieldtool.identify.likelihood.expected import Noise
-from fieldtool.identify.multisine.pilot import read_pilot
+from fieldtool.identify.multisine.pilot import PilotFindings, read_pilot
 from fieldtool.records.model import MachineModel
 from fieldtool.records.recording import Experiment, Recording, RecordingWriter
 from fieldtool.workflow.models import check_torque_scale, prior_model
@@ -212,10 +212,8 @@ class FastMeasurement:
         screen.fast_plan(planned)
         return pilot
 
-    def _plan_after(
-        self, recording: Recording, pilot: MultisinePlan
-    ) -> tuple[PlannedFast, Setting]:
-        """Plan the main experiments with what the pilot found, and return what that is."""
+    def _read(self, recording: Recording) -> tuple[PilotFindings, Setting]:
+        """Return what the pilot found, and the machine by it; refuse what it shows to be wrong."""
         session = self._session
         session.screen.doing("find noise, friction and modes in the pilot")
         found = read_pilot(recording, self._setting.model)
@@ -224,8 +222,16 @@ class FastMeasurement:
             session.warn(note)
         modes = ", ".join(f"{w / (2 * np.pi):.2f}" for w in undamped_modes(found.model)[0])
         session.screen.say(f"Resonances found: {modes} Hz." if modes else "The axes are rigid.")
-        now_known = replace(self._setting, model=found.model)
-        check_loops(now_known)
+        known = replace(self._setting, model=found.model)
+        check_loops(known)
+        return found, known
+
+    def _plan_after(
+        self, recording: Recording, pilot: MultisinePlan
+    ) -> tuple[PlannedFast, Setting]:
+        """Plan the main experiments with what the pilot found, and return what that is."""
+        session = self._session
+        found, now_known = self._read(recording)
         main = plan_main(
             now_known,
             pilot.cycle_time,
