@@ -31,7 +31,7 @@ from fieldtool.records.model import MachineModel
 from fieldtool.report.numbers import UNITS, ModelNumber, model_numbers
 from fieldtool.workflow import SessionResult, parameter_table
 from fieldtool.workflow.planning import PlannedFast
-from fieldtool.workflow.verifying import Verified
+from fieldtool.workflow.verified import Verified
 from fieldtool.writeback.transaction import WriteBack
 
 Ask = Callable[[str], bool]

@@ -5,7 +5,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from typing import Any, Literal, Protocol
 
 import yaml
 
@@ -26,11 +26,9 @@ from fieldtool.records.model import MachineModel
 from fieldtool.records.session_folder import SessionFolder
 from fieldtool.records.yaml_file import write_yaml
 from fieldtool.workflow.planning import PlannedFast
+from fieldtool.workflow.verified import Verified
 from fieldtool.writeback.transaction import WriteBack
 from fieldtool.writeback.unfinished import refuse_unfinished
-
-if TYPE_CHECKING:
-    from fieldtool.workflow.verifying import Verified
 
 PlanName = Literal["classic", "fast"]
 
@@ -65,7 +63,7 @@ class Screen(Protocol):
     def designed(self, tuning: Tuning) -> None:
         """New parameters were designed; nothing was written."""
 
-    def verified(self, result: "Verified") -> None:
+    def verified(self, result: Verified) -> None:
         """New parameters were tried on the machine; those that did not stand it are taken back."""
 
 
@@ -100,7 +98,7 @@ class Quiet:
     def designed(self, tuning: Tuning) -> None:
         """Show nothing."""
 
-    def verified(self, result: "Verified") -> None:
+    def verified(self, result: Verified) -> None:
         """Show nothing."""
 
 
@@ -144,7 +142,7 @@ class SessionResult:
     warnings: tuple[str, ...]
     criticism: Criticism | None = None
     """What the simulation gets wrong; None where the data did not allow a criticism."""
-    verification: "Verified | None" = None
+    verification: Verified | None = None
     """What the trial of the new parameters showed; None where nothing was written or tried."""
 
     def as_dict(self) -> dict[str, Any]:

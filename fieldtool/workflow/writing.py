@@ -9,7 +9,8 @@ from fieldtool.design.tuning import Tuning
 from fieldtool.errors import PlanRefusedError
 from fieldtool.records.model import MachineModel
 from fieldtool.workflow.session import Options, Session, parameter_table
-from fieldtool.workflow.verifying import Verification, Verified
+from fieldtool.workflow.verified import Verified
+from fieldtool.workflow.verifying import Verification
 from fieldtool.writeback.transaction import WriteBack, apply, changes_for
 
 Confirm = Callable[[Sequence[Change]], bool]
