@@ -125,7 +125,7 @@ def search(
     names |= {t.effect.key for a in accepted for t in a.ties}
     current = current if accepted else before
     final = _on_all_rows(prepared, current) if accepted else before
-    advance("done", 1.0)
+    advance("describe and draw what was found", 0.95)
     return Found(
         prepared,
         before,
