@@ -85,6 +85,8 @@ def _designed_since(tuning: Tuning, rows: Sequence[Mapping[str, Any]]) -> bool:
 
 def _state(material: Material) -> str:
     written = [event for event in material.events_of("write") if event.get("written")]
+    if not material.events:
+        return "Designed; whether they were written is not known: there is no log."
     if not written:
         return "Designed; nothing was written into the drives."
     if written[-1].get("stored"):

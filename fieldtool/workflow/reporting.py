@@ -14,7 +14,7 @@ from fieldtool.criticise.criticism_file import read_criticism
 from fieldtool.criticise.pictured import pictures_of
 from fieldtool.criticise.pictures_file import load_pictures
 from fieldtool.design.tuning_file import read_tuning
-from fieldtool.errors import FieldtoolError, FileFormatError, OutputError
+from fieldtool.errors import FieldtoolError, FileFormatError
 from fieldtool.frf.response import load_band, load_responses
 from fieldtool.records.files import read_text
 from fieldtool.records.model import MachineModel
@@ -102,6 +102,11 @@ def material_of(folder: SessionFolder) -> Material:
         read_model,
         "the machine was not identified: `fieldtool identify` on this folder.",
     )
+    events, lost = read(folder.events, _events, "what was done was not noted.") or ((), 0)
+    if lost:
+        missing.append(
+            f"{folder.events.name}: lines that are no events (cut off, or damaged): {lost}."
+        )
     criticism = None
     if model is not None:
         known = model
@@ -132,7 +137,7 @@ def material_of(folder: SessionFolder) -> Material:
             for name in DOCUMENTS
             if (found := read(folder.path / f"{name}.yaml", _document, "")) is not None
         },
-        events=_events(folder.events),
+        events=events,
         missing=tuple(missing),
     )
 
@@ -154,18 +159,21 @@ def _document(path: Path) -> Mapping[str, Any]:
     return data
 
 
-def _events(path: Path) -> tuple[Mapping[str, Any], ...]:
-    """Read the log; a line that was cut off is left out."""
-    try:
-        text = read_text(path, LARGEST_LOG)
-    except (FileFormatError, OutputError):
-        return ()
+def _events(path: Path) -> tuple[tuple[Mapping[str, Any], ...], int]:
+    """Read the log; return its events, and how many lines are none.
+
+    Raises
+    ------
+    FileFormatError
+        If it is no text, or too large.
+    """
+    lines = read_text(path, LARGEST_LOG).splitlines()
     out = []
-    for line in text.splitlines():
+    for line in lines:
         try:
             event = json.loads(line)
-        except ValueError:
+        except (ValueError, RecursionError):
             continue
         if isinstance(event, dict):
             out.append(event)
-    return tuple(out)
+    return tuple(out), len(lines) - len(out)

@@ -324,3 +324,31 @@ def test_what_was_written_is_told_from_what_was_designed_or_tried_later():
     table, _ = section.blocks
     assert table.rows[0][3] == "4.2"
     assert "nothing was written" in section.lead
+
+
+@pytest.mark.parametrize("log", [b"\xff\x00 no log\n", b"[1]\n", b"{\n" * 9, None])
+def test_a_log_that_tells_nothing_is_said_and_nothing_is_claimed_from_it(session, tmp_path, log):
+    folder, _ = session
+    part = tmp_path / "part"
+    shutil.copytree(folder.path, part)
+    (part / "events.jsonl").unlink(missing_ok=True)
+    if log is not None:
+        (part / "events.jsonl").write_bytes(log)
+    material = material_of(SessionFolder(part))
+    assert [sentence for sentence in material.missing if "events.jsonl" in sentence]
+    tuning = Tuning((AxisTuning("table", {"velocity_p": 4.2}, 1.5, "why"),))
+    assert "not known" in parameters(replace(material, tuning=tuning)).lead
+
+
+def test_an_event_that_was_cut_off_costs_no_other(session, tmp_path):
+    folder, _ = session
+    part = tmp_path / "part"
+    shutil.copytree(folder.path, part)
+    (part / "events.jsonl").write_text(
+        '{"event": "session"}\n{"event": "wri{"event"}\n{"event": "x"}\n'
+    )
+    material = material_of(SessionFolder(part))
+    assert [event["event"] for event in material.events] == ["session", "x"]
+    assert [
+        one for one in material.missing if one.startswith("events.jsonl: lines that are no events")
+    ]
