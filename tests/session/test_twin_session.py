@@ -15,7 +15,7 @@ from fieldtool.records.model_file import read_model
 from tests.session.conftest import one_axis
 
 KINDS = ("coulomb_friction", "measurement_delay")
-SAME = 0.06
+SAME = 0.03
 """Relative difference of responses that both machines may have where noise allows less."""
 
 
@@ -70,10 +70,14 @@ def test_the_machine_rebuilt_from_a_session_behaves_as_the_one_that_was_measured
     value, other = cause.parameters[parameter].value, found.parameters[parameter].value
     assert other == pytest.approx(value, rel=0.1)
 
-    # The first machine's measured response, and the model identified on its twin.
+    # The model identified on the first machine and that identified on its twin; and, where no friction
+    # bends what is measured, the first machine's measured response.
     measured = load_responses(tmp_path / "first" / "frequency-response.h5")[SOLVED]
-    model = read_model(tmp_path / "again" / "model.yaml")
     f, response, std = measured.element(0, 0)
-    modelled = np.abs(machine_response(model, 2 * np.pi * f)[:, 0, 0])
-    apart = np.abs(np.abs(response) - modelled)
-    assert np.all(apart < SAME * modelled + 4 * std)
+    first_model, model = (read_model(tmp_path / n / "model.yaml") for n in ("first", "again"))
+    own, modelled = (
+        np.abs(machine_response(m, 2 * np.pi * f)[:, 0, 0]) for m in (first_model, model)
+    )
+    assert np.all(np.abs(own - modelled) < SAME * modelled)
+    if part["effect"] == "measurement_delay":
+        assert np.all(np.abs(np.abs(response) - modelled) < SAME * modelled + 4 * std)
