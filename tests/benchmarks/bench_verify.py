@@ -56,6 +56,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from tests.benchmarks.bench_retune import CHANNEL, random_machine, with_old_gains
 from tests.session.conftest import PROCESS_VALUES
+from tests.tunings import scale_model
 
 DISASTERS = ("sign", "gain", "hard", "tuning", "model", "none")
 CAUGHT = (3, 4, 6)
@@ -235,19 +236,8 @@ def _session(
     (session / "tuning.yaml").write_text(yaml.safe_dump(data))
     write_model(truth, session / "model.yaml")
     if disaster == "model":
-        _scale(session / "model.yaml", float(rng.choice([0.5, 2.0])))
+        scale_model(session / "model.yaml", float(rng.choice([0.5, 2.0])))
     return session
-
-
-def _scale(path: Path, factor: float) -> None:
-    data = yaml.safe_load(path.read_text())
-    for axis in data["axes"]:
-        for name in ("masses", "springs", "dampers"):
-            for one in axis[name]:
-                one["value"] *= factor
-    for coupling in data["couplings"]:
-        coupling["value"] *= factor
-    path.write_text(yaml.safe_dump(data))
 
 
 def main() -> None:

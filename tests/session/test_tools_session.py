@@ -11,11 +11,9 @@ from drives.canopen_drive import connect
 from drives.parameters import Transaction
 from drives.profile import load_machine
 from drives.sim.faults import SdoRefused
-from fieldtool.records.model_file import write_model
-from fieldtool.workflow.models import truth_model
 from fieldtool.writeback.temporary import backed_up
 from fieldtool.writeback.tool_sets import tools_folder
-from tests.session.test_verification_session import GOOD, write_tuning
+from tests.tunings import begun
 
 TABLE, ARM = 11, 12
 VELOCITY_P = (0x2010, 2)
@@ -23,11 +21,7 @@ VELOCITY_P = (0x2010, 2)
 
 @pytest.fixture
 def session(bench):
-    bench.out.mkdir()
-    (bench.out / "machine.yaml").write_text(bench.profile.read_text())
-    write_tuning(bench, GOOD)
-    write_model(truth_model(load_machine(bench.profile)), bench.out / "model.yaml")
-    return bench
+    return begun(bench)
 
 
 def tools(bench, *words):

@@ -10,73 +10,22 @@ import numpy as np
 import pytest
 import yaml
 
-from drives.profile import load_machine
 from drives.sim.faults import EncoderStuck, Fault, MotorReversed
 from drives.sim.firmware import Parameter
-from fieldtool.design.loops import Loops
-from fieldtool.design.machine import machine_of, respond
-from fieldtool.design.servo import Timing, servo_from_parameters
-from fieldtool.records.model_file import write_model
 from fieldtool.records.recording import load
 from fieldtool.records.session_folder import SessionFolder
-from fieldtool.workflow.models import truth_model
 from fieldtool.workflow.rescued import rescue
-from tests.session.conftest import GAINS
 from tests.session.test_trial import Gains
+from tests.tunings import GOOD, begun, scale_model, write_tuning
 
 TABLE, ARM = 11, 12
 VELOCITY_P, VELOCITY_I, POSITION_P = (0x2010, 2), (0x2010, 3), (0x2010, 1)
-GOOD = {
-    "table": {"velocity_p": 2.0, "velocity_i": 20.0, "position_p": 12.0, "velocity_ff": 1.0},
-    "arm": {"velocity_p": 1.6, "velocity_i": 16.0, "position_p": 12.0, "velocity_ff": 1.0},
-}
-"""Faster than what is in the drives, with good margins."""
 
 
 @pytest.fixture
 def session(bench):
     """A session folder with a good tuning and the true model."""
-    bench.out.mkdir()
-    (bench.out / "machine.yaml").write_text(bench.profile.read_text())
-    write_tuning(bench, GOOD)
-    write_model(truth_model(load_machine(bench.profile)), bench.out / "model.yaml")
-    return bench
-
-
-def peaks(bench, parameters):
-    """Of sensitivity, with the true model."""
-    machine = machine_of(truth_model(load_machine(bench.profile)))
-    servos = tuple(
-        servo_from_parameters({**GAINS, **own}, Timing(0.22e-3, 0.0)) for own in parameters.values()
-    )
-    response = respond(machine, np.geomspace(1.0, 600.0, 4000))
-    return np.abs(Loops(response, servos).sensitivity).max(axis=0).tolist()
-
-
-def write_tuning(bench, parameters, designed=None):
-    """Write a tuning that says what the designed parameters come to, these or others."""
-    said = peaks(bench, designed or parameters)
-    tuning = {
-        "format": "fieldtool-tuning/1",
-        "axes": [
-            {"axis": axis, "parameters": dict(own), "sensitivity_peak": peak, "reason": "test"}
-            for (axis, own), peak in zip(parameters.items(), said, strict=True)
-        ],
-    }
-    (bench.out / "tuning.yaml").write_text(yaml.safe_dump(tuning))
-
-
-def scaled_model(bench, factor):
-    """Write the true model with all masses, springs and dampers so many times too large."""
-    path = bench.out / "model.yaml"
-    data = yaml.safe_load(path.read_text())
-    for axis in data["axes"]:
-        for name in ("masses", "springs", "dampers"):
-            for one in axis[name]:
-                one["value"] *= factor
-    for coupling in data["couplings"]:
-        coupling["value"] *= factor
-    path.write_text(yaml.safe_dump(data))
+    return begun(bench)
 
 
 def write(bench, *options):
@@ -196,7 +145,7 @@ def test_a_tuning_ten_times_too_high_never_stays(session, factor, names):
 @pytest.mark.parametrize("factor", [0.5, 2.0])
 def test_a_model_wrong_by_two_is_told_by_the_machine(session, factor):
     """What it predicts is not what is measured."""
-    scaled_model(session, factor)
+    scale_model(session.out / "model.yaml", factor)
     outcome = write(session)
     assert outcome.code in (3, 4, 6), outcome.err
     assert session.changed() == {}

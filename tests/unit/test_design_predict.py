@@ -25,6 +25,21 @@ RandomModel = Callable[..., MachineModel]
 LENGTHS = [(1,), (2,), (3,), (2, 1), (1, 3), (2, 3, 1)]
 
 
+def plant_of(model):
+    """The simulated machine of the same values."""
+    chains = tuple(
+        ChainParameters(
+            *(tuple(e.value for e in part) for part in (a.masses, a.springs, a.dampers))
+        )
+        for a in model.axes
+    )
+    names = model.names
+    couplings = tuple(
+        (names.index(c.axes[0]), names.index(c.axes[1]), c.value) for c in model.couplings
+    )
+    return PlantParameters(chains, couplings)
+
+
 def moves_of(model: MachineModel) -> list[TestMove]:
     return [typical_move(a.name, (-2, 2), 4.0, 40.0, 100.0, a.total_mass) for a in model.axes]
 
@@ -145,19 +160,9 @@ def test_simulated_firmware_does_as_predicted(
     found = predict(model, servos, moves)
     if not found.stable:
         pytest.skip("a random filter makes this machine unstable")
-    chains = tuple(
-        ChainParameters(
-            *(tuple(e.value for e in part) for part in (a.masses, a.springs, a.dampers))
-        )
-        for a in model.axes
-    )
-    names = model.names
-    couplings = tuple(
-        (names.index(c.axes[0]), names.index(c.axes[1]), c.value) for c in model.couplings
-    )
     hardware = DriveHardware(1000.0, 0.0, 2**23 / (2 * np.pi))
     k = int(fresh_rng.integers(len(lengths)))
-    axes = SimulatedAxes(PlantParameters(chains, couplings), [hardware] * len(lengths), 1, rate)
+    axes = SimulatedAxes(plant_of(model), [hardware] * len(lengths), 1, rate)
     for i, one in enumerate(values):
         for name, value in one.items():
             axes.set(i, Parameter[name.upper()], value)
@@ -276,20 +281,10 @@ def test_the_peak_of_sensitivity_is_that_of_the_simulated_firmware(
     sides = [DriveSide(a.name, None, timing, 500.0 * a.total_mass, 1e-6) for a in model.axes]
     tuning = design(model, sides, response="stiff")
     assert tuning.prediction is not None
-    chains = tuple(
-        ChainParameters(
-            *(tuple(e.value for e in part) for part in (a.masses, a.springs, a.dampers))
-        )
-        for a in model.axes
-    )
-    names = model.names
-    couplings = tuple(
-        (names.index(c.axes[0]), names.index(c.axes[1]), c.value) for c in model.couplings
-    )
     hardware = DriveHardware(1000.0, 0.0, 2**30 / (2 * np.pi))
     k = int(fresh_rng.integers(2))
     margins = tuning.prediction.axes[k].margins
-    axes = SimulatedAxes(PlantParameters(chains, couplings), [hardware] * 2, 1, rate)
+    axes = SimulatedAxes(plant_of(model), [hardware] * 2, 1, rate)
     for i, one in enumerate(tuning.axes):
         for name, value in one.parameters.items():
             axes.set(i, Parameter[name.upper()], value)
