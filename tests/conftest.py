@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 from fieldtool.records.model import AxisModel, Coupling, Estimate, MachineModel
+from tests.seeds import VARIABLE, fresh_seed, seed_of_run
 
 RandomModel = Callable[..., MachineModel]
+seed_of_run()  # before other processes begin, which inherit it
 os.environ["FIELDTOOL_STATE_DIR"] = tempfile.mkdtemp(prefix="fieldtool-notes-")
 """Of this process: fixtures of whole modules keep no notes where other test processes see them."""
 
@@ -50,6 +52,11 @@ def _random_model(
     return MachineModel(tuple(chains), tuple(couplings))
 
 
+def pytest_report_header() -> str:
+    """Tell the run's number, which draws the same cases again."""
+    return f"{VARIABLE}={seed_of_run()}"
+
+
 @pytest.fixture(autouse=True)
 def _notes_elsewhere(
     monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory
@@ -67,6 +74,4 @@ def random_model() -> RandomModel:
 @pytest.fixture
 def fresh_rng() -> np.random.Generator:
     """Random numbers of a new seed each run; it is printed, and shown when a test fails."""
-    seed = int(np.random.SeedSequence().generate_state(1)[0])
-    print("seed", seed)
-    return np.random.default_rng(seed)
+    return np.random.default_rng(fresh_seed())

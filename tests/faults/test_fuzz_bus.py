@@ -2,13 +2,13 @@
 
 from random import Random
 
-import numpy as np
 import pytest
 
 from tests.faults.bench import Moment
 from tests.faults.fuzz_bus import Noise, disturbed
+from tests.seeds import fresh_seed
 
-SEED = int(np.random.SeedSequence().generate_state(1)[0])
+SEED = fresh_seed()
 
 
 def test_frames_that_are_nobodys_do_not_matter():

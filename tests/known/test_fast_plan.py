@@ -14,6 +14,7 @@ from drives.sim.lockstep_bus import register, unregister
 from drives.sim.machine import simulated_machine
 from fieldtool import workflow
 from fieldtool.workflow import Options, SessionResult
+from tests.seeds import fresh_seed
 
 CHANNEL = "known-fast"
 SECONDS = 30.0
@@ -43,8 +44,7 @@ def drawn_anew(seed: int) -> MachineProfile:
 
 @pytest.fixture(scope="module")
 def result(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SessionResult]:
-    seed = int(np.random.SeedSequence().generate_state(1)[0])
-    print("seed", seed)
+    seed = fresh_seed()
     machine = drawn_anew(seed)
     register(CHANNEL, simulated_machine(machine))
     try:

@@ -28,6 +28,7 @@ from fieldtool.experiment.multisine.plan import (
 from fieldtool.experiment.multisine.runner import run_multisine
 from fieldtool.records.closed_loop import ClosedLoop, loop_from_parameters
 from fieldtool.workflow.models import truth_model
+from tests.seeds import fresh_seed
 
 TABLE, ARM = 11, 12
 FACTOR = 6.0
@@ -92,9 +93,7 @@ def line_phasors(experiment, lines, samples=SAMPLES, periods=PERIODS):
 
 
 def seed_now():
-    seed = int(np.random.SeedSequence().generate_state(1)[0])
-    print("seed", seed)
-    return seed
+    return fresh_seed()
 
 
 @pytest.mark.parametrize("torque", [0.0, 0.3])

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize
 
 from fieldtool.identify.best_input import best_powers, weighted_error
+from tests.seeds import fresh_seed
 
 STRONG = 1e3
 """Of the rows: what is known before is nothing beside it."""
@@ -49,7 +50,7 @@ def test_no_random_powers_do_better(seed: int) -> None:
 
 
 def test_a_general_solver_finds_hardly_more() -> None:
-    rng = np.random.default_rng(int(np.random.SeedSequence().generate_state(1)[0]))
+    rng = np.random.default_rng(fresh_seed())
     over = []
     for _ in range(7):
         rows = STRONG * rng.standard_normal((8, 2, 3))

@@ -18,6 +18,7 @@ from drives.sim.firmware import (
     SimulationDivergedError,
 )
 from drives.sim.plant import ChainParameters, PlantParameters
+from tests.seeds import fresh_seed
 
 P = Parameter
 RATE = 8000.0
@@ -218,8 +219,7 @@ def test_torque_limit_and_peak() -> None:
 
 
 def test_measured_torque_has_the_noise_and_the_resolution_it_should() -> None:
-    seed = int(np.random.default_rng().integers(2**32))
-    print(f"seed {seed}")
+    seed = fresh_seed()
     axes = rigid_axis(seed=seed, torque_noise=0.2)
     axes.follow_torque(0, 4.0)
     axes.advance(200)
@@ -290,8 +290,7 @@ def test_interpolation_is_a_straight_line_that_ends_on_the_target() -> None:
 
 
 def test_interval_ends_exactly_on_any_target() -> None:
-    seed = int(np.random.default_rng().integers(2**32))
-    print(f"seed {seed}")
+    seed = fresh_seed()
     axes = rigid_axis()
     for target in np.random.default_rng(seed).uniform(-3.0, 3.0, 500):
         axes.follow_position(0, target, 7)

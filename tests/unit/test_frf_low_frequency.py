@@ -5,6 +5,7 @@ import pytest
 
 from fieldtool.errors import NotEnoughDataError
 from fieldtool.frf.low_frequency import dynamic_stiffness_low
+from tests.seeds import fresh_seed
 
 F = np.array([0.5, 0.7, 1.0, 1.4, 2.0, 2.5])
 TOTAL = 5.0
@@ -26,8 +27,7 @@ def measured(
 
 @pytest.mark.parametrize("friction", [0.0, 0.5, 3.0])
 def test_mass_and_its_error(friction: float) -> None:
-    start = int(np.random.SeedSequence().generate_state(1)[0]) // 2
-    print("seed", start)
+    start = fresh_seed() // 2
     z = []
     for seed in range(start, start + 200):
         position, torque, std = measured(seed, 3e-4, friction)

@@ -17,6 +17,7 @@ from fieldtool.frf.matrix import (
 from fieldtool.frf.phasors import Phasors
 from fieldtool.frf.stepped.responses import stepped_responses
 from fieldtool.records.recording import AxisInfo, Experiment, Recording, Segment
+from tests.seeds import fresh_seed
 
 AXES = ("a", "b", "c")
 FREQUENCIES = np.array([1.0, 2.5, 4.0])
@@ -121,8 +122,7 @@ def test_too_few_or_dependent_experiments_are_refused() -> None:
 
 @pytest.mark.parametrize("how", ["columns", "solved"])
 def test_the_standard_error_is_the_scatter_of_repetitions(how: str) -> None:
-    start = int(np.random.SeedSequence().generate_state(1)[0]) // 2
-    print("seed", start)
+    start = fresh_seed() // 2
     errors, claimed = [], []
     for repetition in range(200):
         seeds = [start + 3 * repetition + k for k in range(3)]
@@ -160,8 +160,7 @@ def test_what_was_measured_twice_is_averaged_by_weight() -> None:
 
 def test_from_time_signals_to_the_response() -> None:
     """Stepped sines of a known response; also segments that had not settled are left out."""
-    seed = int(np.random.SeedSequence().generate_state(1)[0])
-    print("seed", seed)
+    seed = fresh_seed()
     rng = np.random.default_rng(seed)
     period, frequencies = 0.004, np.array([0.9, 2.3, 5.1])
     G = compliance(frequencies)

@@ -10,6 +10,7 @@ from fieldtool.frf.matrix import column_responses
 from fieldtool.frf.multisine.periods import average_periods
 from fieldtool.frf.multisine.single_axis import MultisineResult, analyse_multisine
 from fieldtool.records.recording import AxisInfo, Experiment, Recording
+from tests.seeds import fresh_seed
 
 N, PERIODS, RATE = 500, 12, 500.0
 LINES = np.arange(5, 100, 4)
@@ -70,9 +71,7 @@ def analyse(recording: Recording, **options: int) -> MultisineResult:
 
 
 def new_seed() -> int:
-    seed = int(np.random.SeedSequence().generate_state(1)[0]) // 2
-    print("seed", seed)
-    return seed
+    return fresh_seed() // 2
 
 
 @pytest.mark.parametrize("reference", ["torque_reference", "position_reference", None])

@@ -8,14 +8,13 @@ import pytest
 from fieldtool.errors import NotEnoughDataError
 from fieldtool.frf.phasors import fit_block, fit_sine, settled
 from fieldtool.frf.stepped.quality import distortion_share, judge
+from tests.seeds import fresh_seed
 
 PERIOD = 0.004
 
 
 def new_seed() -> int:
-    seed = int(np.random.SeedSequence().generate_state(1)[0])
-    print("seed", seed)
-    return seed
+    return fresh_seed()
 
 
 def wave(time: np.ndarray, frequency: float, amplitude: complex) -> np.ndarray:

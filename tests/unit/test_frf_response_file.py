@@ -9,6 +9,7 @@ import pytest
 
 from fieldtool.errors import FileFormatError, OutputError
 from fieldtool.frf.response import FrequencyResponse, load_responses, save_responses
+from tests.seeds import fresh_seed
 
 
 def random_response(seed: int) -> FrequencyResponse:
@@ -20,8 +21,7 @@ def random_response(seed: int) -> FrequencyResponse:
 
 
 def test_a_file_gives_back_what_was_saved(tmp_path: Path) -> None:
-    seed = int(np.random.SeedSequence().generate_state(1)[0]) // 2
-    print("seed", seed)
+    seed = fresh_seed() // 2
     saved = {"free": random_response(seed), "locked a/b": random_response(seed + 1)}
     save_responses(saved, tmp_path / "f.h5")
     found = load_responses(tmp_path / "f.h5")

@@ -21,15 +21,14 @@ from fieldtool.identify.modes.model import (
 from fieldtool.identify.modes.poles import Responses, find_poles, start_poles
 from fieldtool.identify.modes.sum_rule import sum_rule, sum_rule_jacobian
 from fieldtool.records.model import AxisModel, Coupling, Estimate, MachineModel
+from tests.seeds import fresh_seed
 
 LENGTHS = {"branch 1": 3, "branch 2": 3, "branch 3": 3}
 
 
 @pytest.fixture
 def rng():
-    seed = np.random.SeedSequence().entropy
-    print(f"seed {seed}")
-    return np.random.default_rng(seed)
+    return np.random.default_rng(fresh_seed())
 
 
 def estimates(values):

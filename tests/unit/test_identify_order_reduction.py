@@ -21,6 +21,7 @@ from fieldtool.identify.chains.order_reduction import (
 )
 from fieldtool.identify.chains.spectrum import Spectrum
 from fieldtool.records.model import AxisModel, Estimate, MachineModel
+from tests.seeds import fresh_seed
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 
@@ -39,9 +40,7 @@ bench = load("bench_order_reduction")
 
 @pytest.fixture
 def rng():
-    seed = np.random.SeedSequence().entropy
-    print(f"seed {seed}")
-    return np.random.default_rng(seed)
+    return np.random.default_rng(fresh_seed())
 
 
 def simple(masses, springs, **known):

@@ -15,13 +15,12 @@ from fieldtool.identify.likelihood.parameters import (
 from fieldtool.identify.likelihood.refine import machine_response, refine, response_derivatives
 from fieldtool.identify.likelihood.response_data import ResponseMatrix
 from fieldtool.records.model import AxisModel, Coupling, Estimate, MachineModel
+from tests.seeds import fresh_seed
 
 
 @pytest.fixture
 def rng():
-    seed = np.random.SeedSequence().entropy
-    print(f"seed {seed}")
-    return np.random.default_rng(seed)
+    return np.random.default_rng(fresh_seed())
 
 
 def estimates(values):

@@ -7,6 +7,7 @@ from fieldtool.errors import NotEnoughDataError
 from fieldtool.identify.prediction import load_responses, predict_load
 from fieldtool.records.model import AxisModel, Estimate, MachineModel
 from fieldtool.records.recording import AxisInfo, Experiment, Recording
+from tests.seeds import fresh_seed
 
 N, RATE, PERIODS, DELAY = 500, 500.0, 5, 3e-4
 LINES = np.arange(5, 120)
@@ -28,8 +29,7 @@ def machine(load: float = 2.0, friction: float = 0.5) -> MachineModel:
 
 
 def recorded(load_friction: float = 0.0) -> Recording:
-    seed = int(np.random.SeedSequence().generate_state(1)[0])
-    print("seed", seed)
+    seed = fresh_seed()
     rng = np.random.default_rng(seed)
     torque = np.zeros(N // 2 + 1, dtype=complex)
     torque[LINES] = np.exp(2j * np.pi * rng.random(LINES.size)) * N

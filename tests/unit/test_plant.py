@@ -12,6 +12,7 @@ from scipy.linalg import eigh
 from drives.sim.effects import ViscousFriction
 from drives.sim.firmware import DriveHardware, SimulatedAxes
 from drives.sim.plant import ChainParameters, Plant, PlantParameters
+from tests.seeds import fresh_seed
 
 PAPER_RESONANCES = [0, 0, 0, 24.62754, 29.58887, 34.16101, 44.92407, 48.60318, 51.28013]  # rad/s
 PAPER_ANTIRESONANCES = {
@@ -239,8 +240,7 @@ def chain_momenta(plant: Plant, state: np.ndarray) -> np.ndarray:
     [(0.0, 2e-8), (1e3, 1e-7)],  # rad; N m s: positions far away are rounded more coarsely
 )
 def test_energy_and_momentum_are_kept(far_away: float, tolerance: float) -> None:
-    seed = int(np.random.default_rng().integers(2**32))
-    print(f"seed {seed}")
+    seed = fresh_seed()
     axes = free_machine(paper_machine())
     plant = axes.plant
     state = np.random.default_rng(seed).standard_normal(2 * plant.size)

@@ -22,6 +22,7 @@ from fieldtool.records.recording import (
     load,
     save,
 )
+from tests.seeds import fresh_seed
 
 
 def random_recording(seed: int, experiments: int = 3) -> Recording:
@@ -109,8 +110,7 @@ def assert_same(a: Recording, b: Recording) -> None:
 
 @pytest.mark.parametrize("_", range(5))
 def test_file_and_folder_give_back_what_was_saved(tmp_path: Path, _: int) -> None:
-    seed = int(np.random.SeedSequence().generate_state(1)[0])
-    print("seed", seed)
+    seed = fresh_seed()
     original = random_recording(seed)
     save(original, tmp_path / "r.h5")
     assert_same(original, load(tmp_path / "r.h5"))

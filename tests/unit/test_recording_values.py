@@ -13,6 +13,7 @@ from fieldtool.records.recording import (
     Segment,
     grid_fault,
 )
+from tests.seeds import fresh_seed
 
 PERIOD = 0.002
 AXES = (AxisInfo("x", "rotary"), AxisInfo("slide", "linear", torque_unit="N", position_unit="m"))
@@ -66,8 +67,7 @@ def test_a_gap_in_time_is_named_by_row(edit, row: int, words: str) -> None:  # t
 
 
 def test_jitter_of_a_clock_is_no_gap() -> None:
-    seed = int(np.random.SeedSequence().generate_state(1)[0])
-    print("seed", seed)
+    seed = fresh_seed()
     jitter = np.random.default_rng(seed).uniform(-0.004, 0.004, 1000) * PERIOD
     assert grid_fault(np.arange(1000) * PERIOD + jitter, PERIOD) is None
 

@@ -22,6 +22,7 @@ from fieldtool.experiment.stepped.runner import DRIFTED, OVERLOAD, Progress, run
 from fieldtool.records.closed_loop import AxisLoop, ClosedLoop
 from fieldtool.records.model import AxisModel, Coupling, Estimate, MachineModel
 from fieldtool.records.recording import Experiment
+from tests.seeds import fresh_seed
 
 STEP = 0.004
 Distort = Callable[[np.ndarray, np.ndarray, np.ndarray], None]
@@ -148,8 +149,7 @@ class FakeMotion:
 def test_the_fake_moves_as_the_closed_loop_does() -> None:
     group = FakeGroup(machine(), np.array([0.1, -0.2]))
     motion = FakeMotion(group, STEP, ("y",))
-    seed = int(np.random.SeedSequence().generate_state(1)[0])
-    print("seed", seed)
+    seed = fresh_seed()
     targets = motion.start + np.cumsum(np.random.default_rng(seed).normal(size=(200, 2)), axis=0)
     blocks = iter([targets[:1], targets[1:3], targets[3:150]])
     captures = [motion.stream(lambda _: next(blocks, None))]
@@ -337,8 +337,7 @@ def test_no_spoiled_row_is_ever_in_a_segment() -> None:
     sweep = replace(the_plan.sweeps[0], settle_blocks=5, blocks=2)
     the_plan = replace(the_plan, sweeps=(sweep,))
     way, n = way_and_block(the_plan)
-    seed = int(np.random.SeedSequence().generate_state(1)[0])
-    print("seed", seed)
+    seed = fresh_seed()
     rng = np.random.default_rng(seed)
     for _ in range(20):
         missing: dict[int, tuple[int, ...]] = {
