@@ -6,6 +6,7 @@ import typer
 from rich.console import Console
 
 from drives.parameters import Change
+from fieldtool.cli.output import told
 from fieldtool.cli.screen import parameter_table_of
 from fieldtool.cli.stop_key import StopKey, somebody_there
 from fieldtool.errors import PlanRefusedError
@@ -32,6 +33,6 @@ def may_write(
                 "asking. Nothing was written."
             )
         where = "working memory, and store them" if store else "working memory (not stored)"
-        return typer.confirm(f"Write these parameters into the drives' {where}?", err=True)
+        return typer.confirm(told(f"Write these parameters into the drives' {where}?"), err=True)
 
     return ask

@@ -7,12 +7,12 @@ from typing import Annotated
 
 import typer
 from rich.console import Console
-from rich.table import Table
 from rich.text import Text
 
 from fieldtool import workflow
 from fieldtool.cli.bus_options import Bitrate, Channel, Interface, on_bus
-from fieldtool.cli.output import Json, console_of, print_json
+from fieldtool.cli.output import Json, console_of, print_json, told
+from fieldtool.cli.sheet import Sheet
 from fieldtool.cli.stop_key import somebody_there, stop_key
 from fieldtool.cli.tracing import TraceFile, TraceWanted, trace_path
 from fieldtool.experiment.checks.finding import Finding, Status
@@ -65,8 +65,10 @@ def check(
             return False
         axes = ", ".join(f"{a.name} by {way_of(a):.2g} {unit_of(a)}" for a in profile.axes)
         return typer.confirm(
-            f"Now every axis is enabled and moves a little and back: {axes}. Keep clear of the "
-            "machine.\nMove the axes now?",
+            told(
+                f"Now every axis is enabled and moves a little and back: {axes}. Keep clear of the "
+                "machine.\nMove the axes now?"
+            ),
             err=True,
         )
 
@@ -89,17 +91,15 @@ def check(
 
 def show(console: Console, result: CheckResult) -> None:
     """Show all findings, those of the machine first, then axis by axis, and the summary."""
-    table = Table(box=None, padding=(0, 1), show_edge=False)
-    for title in ("", "check", "found, and what to do"):
-        table.add_column(title, overflow="fold")
+    table = Sheet("", "check", "found, and what to do", gap=1)
     axes = list(dict.fromkeys(one.axis for one in result.findings))
     for axis in sorted(axes, key=bool):
         if axis:
-            table.add_row("", "", "")
-            table.add_row("", Text(axis, style="bold"), "")
+            table.add()
+            table.add("", Text(axis, style="bold"))
         for one in result.findings:
             if one.axis == axis:
-                table.add_row(*_row(one))
+                table.add(*_row(one))
     console.print(table)
     style = STYLES[result.verdict]
     console.print(Text(result.sentence, style=style))

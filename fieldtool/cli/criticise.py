@@ -1,17 +1,16 @@
 """``fieldtool criticise``: what the simulation gets wrong, why, and what is gained by knowing."""
 
 from pathlib import Path
-from types import TracebackType
 from typing import Annotated
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
-from rich.table import Table
 from rich.text import Text
 
 from fieldtool import workflow
-from fieldtool.cli.output import Json, console_of, print_json
+from fieldtool.cli.output import Json, console_of, indented, print_json
+from fieldtool.cli.progress import ShareBar
+from fieldtool.cli.sheet import Sheet
 from fieldtool.criticise.criticism import Cause, Criticism
 from fieldtool.report.verdict import MEANING
 
@@ -44,7 +43,7 @@ def criticise(
 ) -> None:
     """Say what the simulation of a recording gets wrong, name causes, measure the gain."""
     console = console_of(as_json)
-    with SearchBar(console) as bar:
+    with ShareBar(console, "simulate") as bar:
         found = workflow.criticise(source, model, picture, bar, report)
     show_criticism(console, found.criticism)
     if source.is_dir():
@@ -62,38 +61,6 @@ def criticise(
         )
 
 
-class SearchBar:
-    """A bar with what is done and how long the rest may take; shown on terminals only."""
-
-    def __init__(self, console: Console) -> None:
-        self._bar = Progress(
-            TextColumn("  {task.description}"),
-            BarColumn(),
-            TaskProgressColumn(),
-            TimeRemainingColumn(),
-            console=console,
-            transient=True,
-            disable=not console.is_terminal,
-        )
-        self._task = self._bar.add_task("simulate", total=1.0)
-
-    def __enter__(self) -> "SearchBar":
-        self._bar.start()
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self._bar.stop()
-
-    def __call__(self, what: str, share: float) -> None:
-        """Show what is done."""
-        self._bar.update(self._task, completed=share, description=what)
-
-
 def show_criticism(console: Console, criticism: Criticism) -> None:
     """Show where it is wrong, the causes with their numbers, the gain, and what is left."""
     meaning = MEANING[criticism.verdict].removeprefix(f"{criticism.verdict}: ")
@@ -103,29 +70,27 @@ def show_criticism(console: Console, criticism: Criticism) -> None:
         )
     )
     for sentence in (*criticism.changes, *criticism.where):
-        console.print(Text(f"  {sentence}"))
+        console.print(indented(f"{sentence}"))
     if criticism.causes:
         console.print(_causes(criticism.causes))
         for cause in criticism.causes:
             for tie in cause.ties:
                 axis = tie.axis if isinstance(tie.axis, str) else " - ".join(tie.axis)
                 console.print(
-                    Text(
-                        f"  {cause.effect} of {cause.axis_words}: {tie.effect} ({axis}, {tie.location}) "
+                    indented(
+                        f"{cause.effect} of {cause.axis_words}: {tie.effect} ({axis}, {tie.location}) "
                         f"explains the data as well. To tell them apart, {tie.experiment}."
                     )
                 )
     for sentence in criticism.unexplained:
-        console.print(Text(f"  Unexplained: {sentence}"))
+        console.print(indented(f"Unexplained: {sentence}"))
     console.print(_gain(criticism))
     for sentence in criticism.notes:
-        console.print(Text(f"  {sentence}"))
+        console.print(indented(f"{sentence}"))
 
 
-def _causes(causes: tuple[Cause, ...]) -> Table:
-    table = Table(box=None, padding=(0, 2))
-    for title in ("cause", "axis", "where", "numbers", "explains"):
-        table.add_column(title, overflow="fold")
+def _causes(causes: tuple[Cause, ...]) -> Sheet:
+    table = Sheet("cause", "axis", "where", "numbers", "explains")
     for c in causes:
         numbers = "\n".join(
             f"{name} {n.value:.4g} +- {1.96 * n.std:.2g} {n.unit}"
@@ -135,26 +100,18 @@ def _causes(causes: tuple[Cause, ...]) -> Table:
             if n.std == n.std or name not in HIDDEN
         )
         gain = f"{100 * c.gain:.2g} % of the torque"
-        table.add_row(Text(c.effect), Text(c.axis_words), Text(c.location), Text(numbers), gain)
+        table.add(c.effect, c.axis_words, c.location, numbers, gain)
     return table
 
 
-def _gain(criticism: Criticism) -> Table:
+def _gain(criticism: Criticism) -> Sheet:
     held = criticism.held_out
-    table = Table(box=None, padding=(0, 2))
-    for title in (
-        "unseen data",
-        "torque error before",
-        "after",
-        "noise",
-        "position before",
-        "after",
-    ):
-        table.add_column(title)
+    titles = ("unseen data", "torque error before", "after", "noise", "position before", "after")
+    table = Sheet(*titles, whole=titles[1:])
     for name, before in held.error_before.items():
         after, noise = held.error_after[name], held.noise_floor[name]
-        table.add_row(
-            Text(name),
+        table.add(
+            name,
             f"{100 * before.torque:.3g} %",
             f"{100 * after.torque:.3g} %",
             "not known" if noise is None else f"{100 * noise:.2g} %",

@@ -1,18 +1,18 @@
 """``fieldtool design``: new parameters from the model, and what they will do."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from math import isfinite, isnan
 from pathlib import Path
 from typing import Annotated
 
 import typer
 from rich.console import Console
-from rich.table import Table
 from rich.text import Text
 
 from fieldtool import workflow
-from fieldtool.cli.criticise import SearchBar
-from fieldtool.cli.output import Json, console_of, print_json
+from fieldtool.cli.output import Json, console_of, indented, print_json
+from fieldtool.cli.progress import ShareBar
+from fieldtool.cli.sheet import Sheet
 from fieldtool.design.predict import AxisPrediction
 from fieldtool.design.tuning import BOUND, MOST_BOUND, RESPONSES, Tuning
 from fieldtool.design.tuning_file import tuning_as_dict
@@ -72,13 +72,13 @@ def design(
             f"--bound is a number above 1.1, and {MOST_BOUND:g} at most; got {bound:g}"
         )
     console = console_of(as_json)
-    with SearchBar(console) as bar:
+    with ShareBar(console, "design") as bar:
         tuning = workflow.redesign(folder, response, bound, png, bar)
     show_tuning(console, tuning)
     for axis in tuning.axes:
         console.print(Text(f"{axis.axis}:"))
         for name, value in axis.parameters.items():
-            console.print(Text(f"  {name:22}{value:.6g}"))
+            console.print(indented(f"{name:22}{value:.6g}"))
     console.print(Text(f"Kept in {folder}; `fieldtool write {folder}` brings it into the drives."))
     if as_json:
         print_json(tuning_as_dict(tuning))
@@ -93,30 +93,33 @@ def check_response(response: str) -> None:
 def show_tuning(console: Console, tuning: Tuning) -> None:
     """Show why, what is to be expected beside what is there now, and what to know."""
     for axis in tuning.axes:
-        console.print(Text(f"  {axis.axis}: {axis.reason}"))
+        console.print(indented(f"{axis.axis}: {axis.reason}"))
     if tuning.prediction is not None:
-        console.print(_table(tuning))
+        for table in _tables(tuning, console.width):
+            console.print(table)
     for sentence in (*(one.sentence for one in tuning.shaping), *tuning.notes):
-        console.print(Text(f"  {sentence}"))
+        console.print(indented(f"{sentence}"))
 
 
-def _table(tuning: Tuning) -> Table:
-    table = Table(box=None, padding=(0, 2))
-    table.add_column("predicted (SI)")
+def _tables(tuning: Tuning, width: int) -> list[Sheet]:
+    """Return what is predicted, as many axes side by side as the terminal has room for."""
     prediction = tuning.prediction
     axes = prediction.axes if prediction is not None else ()
-    for axis in axes:
-        if tuning.present is not None:
-            table.add_column(f"{axis.axis} now", justify="right")
-            table.add_column("new", justify="right")
-        else:
-            table.add_column(axis.axis, justify="right")
+    for count in range(len(axes), 0, -1):
+        tables = [_table(tuning, axes[k : k + count]) for k in range(0, len(axes), count)]
+        if count == 1 or max(table.natural_width for table in tables) <= width:
+            return tables
+    return []
+
+
+def _table(tuning: Tuning, axes: Sequence[AxisPrediction]) -> Sheet:
+    """Return present and predicted figures of some axes."""
+    now = tuning.present
+    titles = [title for a in axes for title in ((f"{a.axis} now", "new") if now else (a.axis,))]
+    table = Sheet("predicted (SI)", *titles, numbers=titles)
     for title, scale, of in ROWS:
-        row = [title]
-        for axis in axes:
-            pair = [tuning.present.of(axis.axis)] if tuning.present is not None else []
-            row += [_cell(of(one), scale) for one in (*pair, axis)]
-        table.add_row(*row)
+        shown = [one for axis in axes for one in ((now.of(axis.axis), axis) if now else (axis,))]
+        table.add(title, *(_cell(of(one), scale) for one in shown))
     return table
 
 

@@ -15,7 +15,6 @@ from typing import Annotated, ParamSpec
 
 import typer
 from rich.console import Console
-from rich.text import Text
 from threadpoolctl import threadpool_limits
 
 from drives.errors import (
@@ -37,7 +36,7 @@ from fieldtool.cli.check import check
 from fieldtool.cli.criticise import criticise
 from fieldtool.cli.design import ResponseChoice, check_response, design
 from fieldtool.cli.distinguish import ToDistinguish, tell_apart
-from fieldtool.cli.output import Json, console_of, print_json
+from fieldtool.cli.output import Json, console_of, indented, print_json
 from fieldtool.cli.profile import profile_app
 from fieldtool.cli.replay import replay_command
 from fieldtool.cli.report import report
@@ -376,9 +375,9 @@ def identify(
     console.print(model_table(found.model, None, found.torque_units))
     if found.chain is not None:
         for line in found.chain.sentences:
-            console.print(f"  {line}")
+            console.print(indented(line))
     for note in found.notes:
-        console.print(Text(f"  {note}"))
+        console.print(indented(f"{note}"))
     if planned is not None:
         with TerminalScreen(console) as screen:
             screen.stage("What the next measurement should be")

@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.text import Text
 
 from drives.profile.schema import ProfileKind, json_schema
-from fieldtool.cli.output import Json, console_of, print_json
+from fieldtool.cli.output import Json, console_of, indented, print_json
 from fieldtool.workflow.profiling import CheckedProfile, check_profile, new_profile
 
 profile_app = typer.Typer(
@@ -65,12 +65,14 @@ def _show(console: Console, found: CheckedProfile) -> None:
         gains = [key for key in keys if key.startswith("parameters.")]
         for key in keys:
             if key not in gains:
-                console.print(Text(f"  {key}"))
+                console.print(indented(f"{key}"))
         if gains:
             console.print(
-                Text(f"  unit, scale or write of {len(gains)} parameters; keep those of the loops")
+                indented(
+                    f"unit, scale or write of {len(gains)} parameters; keep those of the loops"
+                )
             )
     if found.obstacles:
         console.print(Text("Until then, or with such a drive at all:"))
         for phrase in found.obstacles:
-            console.print(Text(f"  {phrase}"))
+            console.print(indented(f"{phrase}"))

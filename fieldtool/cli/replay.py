@@ -7,14 +7,14 @@ from typing import Annotated, Any
 
 import typer
 from rich.console import Console
-from rich.table import Table
 from rich.text import Text
 
 from drives.objects import ObjectAddress
 from drives.profile import MachineProfile
 from drives.replay import Decoded
-from fieldtool.cli.output import Json, console_of, print_json
+from fieldtool.cli.output import Json, console_of, indented, print_json
 from fieldtool.cli.screen import TerminalScreen
+from fieldtool.cli.sheet import Sheet
 from fieldtool.cli.stop_key import stop_key
 from fieldtool.cli.tracing import unused
 from fieldtool.workflow.replay_again import Again, again
@@ -189,21 +189,20 @@ def show(console: Console, result: Replayed) -> None:
             f"{p.deviation * 1e6:.3g} us, shortest {p.shortest * 1000:.4g} ms, longest "
             f"{p.longest * 1000:.4g} ms; {p.late} late; {p.pauses} pauses."
         )
-        console.print(f"  {pace_words(p.syncs, p.late, p.pauses)}")
+        console.print(indented(pace_words(p.syncs, p.late, p.pauses)))
     console.print(
         f"Bus load: {100 * s.mean_load:.1f} % in the mean, {100 * s.peak_load:.1f} % at most over "
         "0.1 s (worst-case stuffing)."
     )
-    console.print(f"  {load_words(s.peak_load)}")
+    console.print(indented(load_words(s.peak_load)))
     if s.pdos:
-        table = Table(box=None, padding=(0, 2))
-        for title in ("PDOs of node", "received", "missing", "doubled"):
-            table.add_column(title, justify="right")
+        titles = ("PDOs of node", "received", "missing", "doubled")
+        table = Sheet(*titles, numbers=titles)
         for one in s.pdos:
-            table.add_row(*map(str, (one.node, one.received, one.missing, one.doubled)))
+            table.add(*map(str, (one.node, one.received, one.missing, one.doubled)))
         console.print(table)
         console.print(
-            f"  {pdo_words(sum(p.missing for p in s.pdos), sum(p.doubled for p in s.pdos))}"
+            indented(pdo_words(sum(p.missing for p in s.pdos), sum(p.doubled for p in s.pdos)))
         )
     for what, lines in (
         (
@@ -217,9 +216,9 @@ def show(console: Console, result: Replayed) -> None:
         if lines:
             console.print(Text(f"{what}:"))
             for line in lines[:MOST_LINES]:
-                console.print(Text(f"  {_plain(line)}"))
+                console.print(indented(f"{_plain(line)}"))
             if len(lines) > MOST_LINES:
-                console.print(f"  ... and {len(lines) - MOST_LINES} more")
+                console.print(indented(f"... and {len(lines) - MOST_LINES} more"))
     if s.unanswered:
         console.print(f"SDO requests without an answer: {s.unanswered}.")
     _show_recording(console, result)
@@ -283,7 +282,7 @@ def _show_recording(console: Console, result: Replayed) -> None:
     for one in result.experiments:
         if not one.whole:
             console.print(
-                Text(f"  {one.experiment}: {one.rows_found} of {one.rows} rows", style="red")
+                indented(f"{one.experiment}: {one.rows_found} of {one.rows} rows", style="red")
             )
 
 

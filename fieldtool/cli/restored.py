@@ -1,10 +1,10 @@
 """What a restore looks like on a terminal: what each drive held, and what was done."""
 
 from rich.console import Console
-from rich.table import Table
-from rich.text import Text
 
 from drives.parameters import DriveOutcome, Memory
+from fieldtool.cli.output import indented
+from fieldtool.cli.sheet import Sheet
 from fieldtool.writeback.restoring import Restored
 
 MEMORY_WORDS = {
@@ -17,11 +17,9 @@ MEMORY_WORDS = {
 
 def show_restored(console: Console, restored: Restored) -> None:
     """Show what each drive held, what was brought back, and where the old values are now."""
-    table = Table(box=None, padding=(0, 2))
-    for title in ("axis", "node", "found", "brought back", "working memory", "non-volatile memory"):
-        table.add_column(title, overflow="fold")
+    table = Sheet("axis", "node", "found", "brought back", "working memory", "non-volatile memory")
     for outcome in restored.outcomes:
-        cells = (
+        table.add(
             outcome.axis,
             str(outcome.node_id),
             _found(outcome, restored.had_write),
@@ -29,10 +27,9 @@ def show_restored(console: Console, restored: Restored) -> None:
             "old values",
             MEMORY_WORDS[outcome.memory],
         )
-        table.add_row(*(Text(cell) for cell in cells))
     console.print(table)
     for sentence in sentences(restored):
-        console.print(Text("  " + sentence))
+        console.print(indented(sentence))
 
 
 def sentences(restored: Restored) -> list[str]:

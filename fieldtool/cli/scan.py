@@ -1,21 +1,20 @@
 """``fieldtool scan``: what is on the bus, on the screen."""
 
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
 import typer
 from rich.console import Console
 from rich.padding import Padding
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-from rich.table import Table
 from rich.text import Text
 
 from drives.profile import BusProfile, MachineProfile
 from drives.scan import ScannedNode
 from fieldtool.cli.bus_options import Bitrate, Channel, Interface, channel_of, on_bus
 from fieldtool.cli.output import Json, console_of, print_json
+from fieldtool.cli.progress import ShareBar
+from fieldtool.cli.sheet import Sheet
 from fieldtool.cli.tracing import TraceFile, trace_path
 from fieldtool.workflow.scanning import ScanResult
 from fieldtool.workflow.scanning import scan as scan_bus
@@ -57,7 +56,7 @@ def scan(
     """Show what is on the bus, and which drive profile fits. Writes nothing, changes no state."""
     bus, known = _bus(machine, interface, channel, bitrate)
     console = console_of(as_json)
-    with _progress(console) as told:
+    with ShareBar(console, "listening") as told:
         result = scan_bus(
             bus,
             known,
@@ -97,25 +96,6 @@ def _bus(
     return bus, None
 
 
-class _progress:  # noqa: N801
-    """A bar for the scan; a context that gives what is told."""
-
-    def __init__(self, console: Console) -> None:
-        columns = (TextColumn("  {task.description}"), BarColumn(), TimeRemainingColumn())
-        self._bar = Progress(*columns, console=console, transient=True)
-        self._shown = console.is_terminal
-
-    def __enter__(self) -> Callable[[str, float], None]:
-        if not self._shown:
-            return lambda _what, _share: None
-        self._bar.start()
-        task = self._bar.add_task("listening", total=1.0)
-        return lambda what, share: self._bar.update(task, description=what, completed=share)
-
-    def __exit__(self, *_: object) -> None:
-        self._bar.stop()
-
-
 def show(console: Console, result: ScanResult) -> None:
     """Show what was found: a table of nodes, then what each would miss, then problems."""
     scanned, traffic = result.scan, result.scan.traffic
@@ -138,32 +118,27 @@ def show(console: Console, result: ScanResult) -> None:
             console.print(Text(f"Every node is as {result.machine.name} says.", style="green"))
 
 
-def _table(nodes: tuple[ScannedNode, ...]) -> Table:
-    table = Table(box=None, padding=(0, 2))
-    for title in ("node", "device", "firmware", "vendor:product", "serial", "state", "profile"):
-        table.add_column(title, overflow="fold")
+def _table(nodes: tuple[ScannedNode, ...]) -> Sheet:
+    table = Sheet("node", "device", "vendor:product", "serial", "state", "profile")
     for node in nodes:
         identity, fit = node.identity, next(iter(node.fits), None)
         state = ", ".join(part for part in (node.heard.state, node.power) if part)
         if identity is None:
-            row = [str(node.node_id), "not asked" if not node.answers else "?", "", "", "", state]
+            row = [str(node.node_id), "not asked" if not node.answers else "?", "", "", state]
         else:
             row = [
                 str(node.node_id),
                 identity.device_name or "(no name)",
-                identity.firmware,
                 f"{identity.vendor_id:X}:{identity.product_code:X}",
                 str(identity.serial_number),
                 state,
             ]
-        cells = [Text(cell) for cell in row]
-        if fit is None:
-            cells.append(Text(""))
-        elif not fit.fits:
-            cells.append(Text("none fits", style="red"))
-        else:
-            cells.append(Text(f"{fit.profile} {fit.verdict}", style=_STYLES[fit.verdict]))
-        table.add_row(*cells)
+        profile = Text()
+        if fit is not None and not fit.fits:
+            profile = Text("none fits", style="red")
+        elif fit is not None:
+            profile = Text(f"{fit.profile} {fit.verdict}", style=_STYLES[fit.verdict])
+        table.add(*row, profile)
     return table
 
 
@@ -184,6 +159,8 @@ def _details(node: ScannedNode) -> tuple[tuple[str, str], ...]:
     """Return lines and their styles."""
     lines: list[tuple[str, str]] = []
     fit = next(iter(node.fits), None)
+    if node.identity is not None and node.identity.firmware:
+        lines.append((f"firmware {node.identity.firmware}", ""))
     if node.modes is not None:
         lines.append((f"modes: {', '.join(node.modes) or 'none that CiA 402 defines'}", ""))
     if fit is not None:

@@ -7,19 +7,14 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    ProgressColumn,
-    SpinnerColumn,
-    Task,
-    TextColumn,
-    TimeElapsedColumn,
-)
 from rich.progress import Progress as Bar
-from rich.table import Table
+from rich.progress import SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.text import Text
 
 from fieldtool.cli.design import show_tuning
+from fieldtool.cli.output import indented
+from fieldtool.cli.progress import Left, bar_of, clock, long, short
+from fieldtool.cli.sheet import Sheet
 from fieldtool.design.tuning import Tuning
 from fieldtool.design.verdict import Comparison
 from fieldtool.experiment.forecast import AxisForecast
@@ -37,25 +32,8 @@ from fieldtool.writeback.transaction import WriteBack
 Ask = Callable[[str], bool]
 WIDE = 110
 """Columns that the table with the drives' own units needs."""
-PACE_FROM = 0.03
-"""Share done from which the pace says how long the rest will take."""
 QUIET_INTERVAL = 5.0
 """Seconds between progress lines where there is no terminal."""
-NUMBER_WIDTH = 9
-"""Characters that a column of numbers is not made narrower than."""
-
-
-class _Left(ProgressColumn):
-    """Time left, from the pace so far; it stays on the screen from the first tone on."""
-
-    def render(self, task: Task) -> Text:
-        """Return e.g. ``1 min 20 s left``."""
-        if task.finished:
-            return Text(f"{_clock(task.elapsed or 0)} taken")
-        if task.completed < PACE_FROM or not task.elapsed:
-            return Text("measuring the pace")
-        left = task.elapsed * (1 - task.completed) / task.completed
-        return Text(f"{_clock(left)} left")
 
 
 class TerminalScreen:
@@ -97,16 +75,16 @@ class TerminalScreen:
                 self._last_shown = perf_counter()
                 done = "" if share is None else f"{100 * share:.0f} %, "
                 self.console.print(
-                    Text(f"  {done}{_clock(self._last_shown - self._busy_since)}; {what}")
+                    indented(f"{done}{clock(self._last_shown - self._busy_since)}; {what}")
                 )
             return
         if self._busy is None:
             self._busy = Bar(
-                TextColumn("  "),
-                SpinnerColumn(),
-                TextColumn("{task.description}", markup=False),
-                TimeElapsedColumn(),
+                SpinnerColumn(table_column=short()),
+                TimeElapsedColumn(table_column=short()),
+                TextColumn("{task.description}", markup=False, table_column=long()),
                 console=self.console,
+                expand=True,
                 transient=True,
                 refresh_per_second=8,
             )
@@ -118,18 +96,17 @@ class TerminalScreen:
     def say(self, sentence: str) -> None:
         """Show a sentence."""
         console = self._bar.console if self._bar else self.console
-        console.print(Text("  " + sentence), style="yellow" if "!" in sentence else "")
+        console.print(indented(sentence, "yellow" if "!" in sentence else ""))
 
     def plan(self, plan: SweepPlan, expected: Sequence[AxisForecast], duration: float) -> None:
         """Show what will move, how far, and for how long."""
         self._close()
-        sweeps = Table(title=None, box=None, padding=(0, 2))
-        for title in ("axis moved", "how", "others floating", "tones", "Hz"):
-            sweeps.add_column(title, style="cyan" if title == "axis moved" else "")
+        sweeps = Sheet(
+            "axis moved", "how", "others floating", "tones", "Hz", numbers=("tones",), whole=("Hz",)
+        )
         for sweep in plan.sweeps:
             tones = [tone.frequency for tone in sweep.tones]
-            _add(
-                sweeps,
+            sweeps.add(
                 sweep.driven,
                 sweep.kind,
                 ", ".join(sweep.free) or "none, all held",
@@ -139,45 +116,47 @@ class TerminalScreen:
         self.console.print(sweeps)
         self._show_moves(expected)
         self.console.print(
-            f"  Simulated with the prior model: every limit is kept. About {_clock(duration)} of "
-            f"machine time, a cycle of {plan.cycle_time * 1000:g} ms."
+            indented(
+                f"Simulated with the prior model: every limit is kept. About {clock(duration)} of "
+                f"machine time, a cycle of {plan.cycle_time * 1000:g} ms."
+            )
         )
 
     def fast_plan(self, planned: PlannedFast) -> None:
         """Show what will move, how far, for how long, and how well it will tell."""
         self._close()
-        table = Table(box=None, padding=(0, 2))
-        for title in ("part", "experiments", "lines", "Hz", "period", "time"):
-            table.add_column(title)
+        titles = ("part", "experiments", "lines", "left out", "Hz", "periods", "time")
+        table = Sheet(*titles, numbers=titles[1:4], whole=titles[4:])
         for name, plan in (("pilot, weak", planned.pilot), ("main", planned.plan)):
             if plan is not None:
                 f = plan.frequencies
                 first = plan.experiments[0]
-                _add(
-                    table,
+                table.add(
                     name,
-                    f"{len(plan.experiments)}, all axes at once",
-                    f"{f.size} odd, {first.detection.size} left out",
+                    str(len(plan.experiments)),
+                    str(f.size),
+                    str(first.detection.size),
                     f"{f[0]:.2f} - {f[-1]:.2f}",
-                    f"{first.period:.2f} s, {first.periods} times",
-                    _clock(plan.duration),
+                    f"{first.periods} x {first.period:.2f} s",
+                    clock(plan.duration),
                 )
         self.console.print(table)
         self._show_moves(planned.moves)
         self.console.print(
-            f"  Simulated with the {planned.rests_on}: every limit is kept. "
-            f"{_clock(planned.duration)} of excitation, a cycle of "
-            f"{planned.plan.cycle_time * 1000:g} ms; all axes stay under position control."
+            indented(
+                f"Simulated with the {planned.rests_on}: every limit is kept. "
+                f"{clock(planned.duration)} of excitation, a cycle of "
+                f"{planned.plan.cycle_time * 1000:g} ms. All axes move at once, and stay under "
+                "position control."
+            )
         )
-        self.console.print(Text("  " + expected_text(planned.accuracy)))
+        self.console.print(indented(expected_text(planned.accuracy)))
 
     def _show_moves(self, expected: Sequence[AxisForecast]) -> None:
-        peaks = Table(box=None, padding=(0, 2))
-        for title in ("axis", "moves at most", "speed", "torque", "following error"):
-            peaks.add_column(title)
+        titles = ("axis", "moves at most", "speed", "torque", "following error")
+        peaks = Sheet(*titles, whole=titles[1:])
         for axis in expected:
-            _add(
-                peaks,
+            peaks.add(
                 axis.axis,
                 f"±{axis.excursion:.3g} {UNITS[axis.kind]['position']}",
                 f"{axis.velocity:.3g} {UNITS[axis.kind]['position']}/s",
@@ -190,16 +169,7 @@ class TerminalScreen:
         """Move the bar."""
         if self._bar is None:
             self._close()
-            self._bar = Bar(
-                TextColumn("  this pass"),
-                BarColumn(bar_width=20),
-                TextColumn("{task.percentage:>3.0f} %"),
-                _Left(),
-                TextColumn("{task.description}", markup=False),
-                console=self.console,
-                transient=True,
-                refresh_per_second=4,
-            )
+            self._bar = bar_of(self.console)
             self._bar.start()
             self._task = self._bar.add_task("", total=1.0)
         self._bar.update(
@@ -211,7 +181,7 @@ class TerminalScreen:
             self._last_shown = perf_counter()
             task = self._bar.tasks[0]
             self.console.print(
-                Text(f"  {100 * progress.done:.0f} %, {_Left().render(task)}; {task.description}")
+                indented(f"{100 * progress.done:.0f} %, {Left().render(task)}; {task.description}")
             )
 
     def ready(self) -> bool:
@@ -240,7 +210,7 @@ class TerminalScreen:
         self.console.print(verification_table(result.axes))
         words = {"verified": "The new parameters stand their trial.", "restored": ""}
         if words.get(result.verdict):
-            self.console.print(Text(f"  {words[result.verdict]}"))
+            self.console.print(indented(f"{words[result.verdict]}"))
 
     def _close(self) -> None:
         self._busy_since = None
@@ -257,8 +227,8 @@ def _what_runs(progress: Progress | MultisineProgress) -> str:
     if isinstance(progress, Progress):
         where = f"sweep {progress.sweep}/{progress.sweeps}"
         return f"{where}: {progress.name}, {progress.frequency:.2f} Hz"
-    part = f"period {progress.period} of {progress.periods}" if progress.period else "run-in"
-    return f"experiment {progress.experiment}/{progress.experiments}: {progress.name}, {part}"
+    part = f"period {progress.period}/{progress.periods}" if progress.period else "run-in"
+    return f"{progress.experiment}/{progress.experiments} {progress.name}, {part}"
 
 
 def expected_text(expected: Expected) -> str:
@@ -276,30 +246,9 @@ def expected_text(expected: Expected) -> str:
     return f"To expect (95 %): {', '.join(parts)}." if parts else "To expect: nothing is told."
 
 
-def _add(table: Table, *cells: str, style: str = "") -> None:
-    """Add a row of plain text: brackets in names are no markup."""
-    table.add_row(*(Text(cell) for cell in cells), style=style)
-
-
-def _column(table: Table, title: str, *, words: bool) -> None:
-    """Add a column that loses nothing on a narrow terminal: words that do not fit are folded.
-
-    Numbers stay whole as long as there is any room: half a number is a wrong number.
-    """
-    if words:
-        table.add_column(title, overflow="fold")
-    else:
-        table.add_column(title, justify="right", overflow="fold", min_width=NUMBER_WIDTH)
-
-
-def _clock(seconds: float) -> str:
-    minutes, rest = divmod(round(seconds), 60)
-    return f"{minutes} min {rest:02d} s" if minutes else f"{rest} s"
-
-
 def model_table(
     model: MachineModel, truth: MachineModel | None, torque_units: Sequence[str] = ()
-) -> Table:
+) -> Sheet:
     """Return all numbers of a model with their 95 % intervals.
 
     Parameters
@@ -309,13 +258,11 @@ def model_table(
     torque_units
         One an axis; N m or N where left out.
     """
-    table = Table(box=None, padding=(0, 1))
-    for title in ("axis", "what", "value", "± (95 %)", "unit"):
-        _column(table, title, words=title in ("axis", "what", "unit"))
+    more = () if truth is None else ("simulated truth", "error")
+    numbers = ("value", "± (95 %)", *more)
+    table = Sheet("axis", "what", *numbers[:2], "unit", *more, numbers=numbers, gap=1)
     true: dict[tuple[str, str], float] = {}
     if truth is not None:
-        _column(table, "simulated truth", words=False)
-        _column(table, "error", words=False)
         true = {_place(n): n.value.value for n in model_numbers(truth)}
     for n in model_numbers(model, torque_units):
         cells = [n.axis, n.what, f"{n.value.value:.5g}", n.interval, n.unit]
@@ -325,7 +272,7 @@ def model_table(
         if known is not None:
             error = f"{100 * (n.value.value / known - 1):+.2f} %" if known else ""
             cells += [f"{known:g}", error]
-        _add(table, *cells)
+        table.add(*cells)
     return table
 
 
@@ -336,12 +283,11 @@ def _place(number: ModelNumber) -> tuple[str, str]:
 
 def parameter_rows(
     rows: Sequence[Mapping[str, Any]], drive_units: Mapping[Any, Any] | None
-) -> Table:
+) -> Sheet:
     """Return old and new parameters, in the drives' units too where given, and what was read back."""
-    table = Table(box=None, padding=(0, 1))
     in_drive = () if drive_units is None else ("old (drive)", "new (drive)")
-    for title in ("axis", "parameter", "old", "new", "unit", *in_drive, "read back"):
-        _column(table, title, words=title in ("axis", "parameter", "unit"))
+    numbers = ("old", "new", *in_drive, "read back")
+    table = Sheet("axis", "parameter", *numbers[:2], "unit", *numbers[2:], numbers=numbers, gap=1)
     for row in rows:
         cells = [
             row["axis"],
@@ -353,7 +299,7 @@ def parameter_rows(
         if drive_units is not None:
             cells += [_plain(v) for v in drive_units.get((row["axis"], row["name"]), ("", ""))]
         cells.append("" if row["read_back"] is None else f"{row['read_back']:.6g}")
-        _add(table, *cells, style="dim" if row["before"] == row["after"] else "")
+        table.add(*cells, style="dim" if row["before"] == row["after"] else "")
     return table
 
 
@@ -368,7 +314,7 @@ def show_result(console: Console, result: SessionResult) -> None:
         show_parameters(console, result.write_back)
     console.print(
         Text(
-            f"\nMachine time {_clock(result.machine_time)}, wall time {_clock(result.wall_time)}. "
+            f"\nMachine time {clock(result.machine_time)}, wall time {clock(result.wall_time)}. "
             f"Everything is in {result.folder}; report.html there, opened in a browser, shows "
             "what was found."
         )
@@ -378,10 +324,10 @@ def show_result(console: Console, result: SessionResult) -> None:
 def show_parameters(console: Console, write_back: WriteBack) -> None:
     """Show old and new parameters, what was read back, and where the new ones are."""
     console.print(parameter_table_of(write_back, console.width))
-    console.print(Text(f"  {write_back.sentence}"))
+    console.print(indented(f"{write_back.sentence}"))
 
 
-def parameter_table_of(write_back: WriteBack, width: int) -> Table:
+def parameter_table_of(write_back: WriteBack, width: int) -> Sheet:
     """Return old and new parameters, in the drives' own units too where the terminal is wide enough."""
     raw = {(c.axis, c.name): (c.before_raw, c.after_raw) for c in write_back.changes}
     return parameter_rows(parameter_table(write_back), raw if width >= WIDE else None)
@@ -396,11 +342,10 @@ _FIGURES = (
 )
 
 
-def verification_table(axes: Sequence[Comparison]) -> Table:
+def verification_table(axes: Sequence[Comparison]) -> Sheet:
     """Return each axis' figures before, as predicted, and after the write."""
-    table = Table(box=None, padding=(0, 1))
-    for title in ("axis", "figure", "before", "predicted", "after", "unit"):
-        _column(table, title, words=title in ("axis", "figure", "unit"))
+    numbers = ("before", "predicted", "after")
+    table = Sheet("axis", "figure", *numbers, "unit", numbers=numbers, gap=1)
     for one in axes:
         for title, name, unit in _FIGURES:
             cells = [
@@ -410,5 +355,5 @@ def verification_table(axes: Sequence[Comparison]) -> Table:
                 for figures in (one.before, one.predicted, one.after)
             ]
             shown = {"s": "s", "": one.unit, None: ""}[unit]
-            _add(table, one.axis, title, *cells, shown)
+            table.add(one.axis, title, *cells, shown)
     return table

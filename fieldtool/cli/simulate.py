@@ -8,7 +8,7 @@ from rich.text import Text
 
 from fieldtool import workflow
 from fieldtool.cli.bus_options import Bitrate, Channel, on_bus
-from fieldtool.cli.output import console_of
+from fieldtool.cli.output import console_of, indented
 from fieldtool.cli.stop_key import stop_key
 
 
@@ -45,7 +45,7 @@ def simulate(
         name = twin.profile.path
         console.print(Text(f"The machine of {machine} as a simulated one: {name}."), soft_wrap=True)
         for sentence in twin.left_out:
-            console.print(Text(f"  Otherwise than there: {sentence}"))
+            console.print(indented(f"Otherwise than there: {sentence}"))
         if interface is None:
             console.print(Text(f"Run it in virtual time: fieldtool run {name}"), soft_wrap=True)
             return

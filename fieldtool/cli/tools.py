@@ -6,14 +6,14 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.table import Table
 from rich.text import Text
 
 from fieldtool import workflow
 from fieldtool.cli.asking import may_write
 from fieldtool.cli.bus_options import Bitrate, Channel, Interface, on_bus
-from fieldtool.cli.output import Json, console_of, print_json
+from fieldtool.cli.output import Json, console_of, indented, print_json
 from fieldtool.cli.screen import TerminalScreen, show_parameters
+from fieldtool.cli.sheet import Sheet
 from fieldtool.cli.stop_key import stop_key
 from fieldtool.workflow.tools import Difference
 from fieldtool.writeback.tool_sets import ToolSet
@@ -39,7 +39,7 @@ def list_tools(machine: Machine, as_json: Json = False) -> None:
     elif not found.bad:
         console.print("No tool set is kept yet: fieldtool tools keep MACHINE NAME --from SESSION")
     for name, problem in found.bad.items():
-        console.print(Text(f"  {name}: can not be used. {problem}"))
+        console.print(indented(f"{name}: can not be used. {problem}"))
 
 
 @tools_app.command()
@@ -73,7 +73,7 @@ def compare(machine: Machine, one: Name, other: Name, as_json: Json = False) -> 
     console.print(_tools_table((a, b)))
     console.print(_difference_table(a, b, differences))
     if not differences:
-        console.print("  They hold the same parameters.")
+        console.print(indented("They hold the same parameters."))
     if as_json:
         print_json(
             {
@@ -134,7 +134,7 @@ def switch(
         )
     show_parameters(console, result)
     if result.in_memory:
-        console.print(Text(f"  `fieldtool restore {folder}` takes it back."))
+        console.print(indented(f"`fieldtool restore {folder}` takes it back."))
     if as_json:
         print_json(
             {
@@ -146,30 +146,28 @@ def switch(
         )
 
 
-def _tools_table(tools: Sequence[ToolSet]) -> Table:
-    table = Table(box=None, padding=(0, 1))
-    for title in ("tool set", "kept (UTC)", "tried", "axis", "settles in, s", "sensitivity peak"):
-        table.add_column(title, overflow="fold")
+def _tools_table(tools: Sequence[ToolSet]) -> Sheet:
+    figures = ("settles in, s", "sensitivity peak")
+    table = Sheet("tool set", "kept (UTC)", "tried", "axis", *figures, numbers=figures)
     for tool in tools:
         first = (tool.name, tool.kept[:16], "yes" if tool.verified else "NO")
         rows = tool.figures or {"": {}}
-        for k, (axis, figures) in enumerate(rows.items()):
+        for k, (axis, measured) in enumerate(rows.items()):
             cells = [
-                "" if (value := figures.get(name)) is None else f"{value:.3g}"
+                "" if (value := measured.get(name)) is None else f"{value:.3g}"
                 for name in ("settling_time", "sensitivity_peak")
             ]
-            table.add_row(*(Text(c) for c in ((*(first if k == 0 else ("",) * 3), axis, *cells))))
+            table.add(*(first if k == 0 else ("",) * 3), axis, *cells)
     return table
 
 
-def _difference_table(a: ToolSet, b: ToolSet, differences: Sequence[Difference]) -> Table:
-    table = Table(box=None, padding=(0, 1))
-    for title in ("axis", "parameter", "object", f"{a.name} (drive)", f"{b.name} (drive)"):
-        table.add_column(title, overflow="fold")
+def _difference_table(a: ToolSet, b: ToolSet, differences: Sequence[Difference]) -> Sheet:
+    held = (f"{a.name} (drive)", f"{b.name} (drive)")
+    table = Sheet("axis", "parameter", "object", *held, numbers=held)
     for d in differences:
         values = [
             "" if v is None else f"{v:.7g}" if isinstance(v, float) else str(v)
             for v in (d.one, d.other)
         ]
-        table.add_row(*(Text(c) for c in (d.axis, d.name, str(d.address), *values)))
+        table.add(d.axis, d.name, str(d.address), *values)
     return table
