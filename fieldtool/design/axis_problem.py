@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fieldtool.design.machine import Machine, respond
+from fieldtool.design.margins import BANDWIDTH_LEVEL
 from fieldtool.design.moves import TestMove
 from fieldtool.design.servo import OFF, Servo, Timing
 from fieldtool.design.waves import HalfWave
@@ -51,8 +52,8 @@ MOST_FED = np.array([1.0, 1.3])
 FAR_GAIN = 0.5
 """Largest gain of the closed loop beyond the frequencies that were measured: there the machine may
 be three times what the model says without making the loop unstable."""
-
-
+WITHIN = 0.998
+"""Of a bandwidth that is to be kept: up to it the sensitivity stays below its level."""
 SOFT = 0.01
 """Weight of a compliance that is missed beside a margin: it is a wish."""
 FED_NOISE = 3.0
@@ -76,6 +77,10 @@ class Bounds:
     """rad/s: highest frequency that the model was measured at."""
     compliance: float = np.inf
     """Largest motor position per torque at the motor, rad/(N m) or m/N."""
+    far: float = FAR_GAIN
+    """Largest gain of the closed loop beyond ``top``."""
+    bandwidths: tuple[float, ...] = ()
+    """rad/s, one an axis: least ones, of the first machine; none where there are none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,6 +191,9 @@ class AxisProblem:
         self._cross = [gains[..., i] * inner[..., i, axis] * inner[..., axis, i] for i in others]
         self._reference = 1 + gains[..., axis] * self._plant
         self._far = grids.omega > bounds.top
+        widths = bounds.bandwidths or (0.0,) * len(servos)
+        held = [grids.omega[0] < WITHIN * widths[i] for i in (axis, *others)]
+        self._held = [below if below.any() else None for below in held]
         self._prepare_motion(grids, servos, axis, moves, others)
 
     def _prepare_motion(
@@ -234,15 +242,18 @@ class AxisProblem:
         if np.abs(turned).max() > 1.0 or not isfinite(peak):
             return UNSTABLE * (1 + min(peak, 1e3)), np.inf
         follow = gain * inverse
-        for own, cross in zip(self._own, self._cross, strict=True):
-            peak = max(peak, float(np.abs(own + cross * follow).max()))
-        excess = peak / self.bounds.sensitivity - 1
+        sizes = [np.abs(inverse)]
+        sizes += [np.abs(a + b * follow) for a, b in zip(self._own, self._cross, strict=True)]
+        excess = max(float(size.max()) for size in sizes) / self.bounds.sensitivity - 1
+        for size, below in zip(sizes, self._held, strict=True):
+            if below is not None:
+                excess = max(excess, float(size[0][below].max()) / BANDWIDTH_LEVEL - 1)
         if isfinite(self.bounds.compliance):
             soft = float(np.abs(self._plant * inverse).max())
             excess = max(excess, SOFT * (soft / self.bounds.compliance - 1))
         if self._far.any():
             far = np.abs(1 - inverse[self._far])
-            excess = max(excess, float(far.max()) / FAR_GAIN - 1)
+            excess = max(excess, float(far.max()) / self.bounds.far - 1)
         if isfinite(self.bounds.noise) and isfinite(self.bounds.resolution):
             noise = servo.torque_noise(self.bounds.resolution)
             excess = max(excess, noise / self.bounds.noise - 1)

@@ -1,22 +1,26 @@
 """From what a search found to what is written: rounded, checked again, compared, explained."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
 from math import inf
 
 import numpy as np
 
-from fieldtool.design.design import Advance, Task, default_moves, find, slower
+from fieldtool.design.design import Advance, Softer, Task, default_moves, find
 from fieldtool.design.drive_side import DriveSide
 from fieldtool.design.loops import Loops, system_matrix
-from fieldtool.design.machine import Machine, machine_of, respond
+from fieldtool.design.machine import Machine, respond
 from fieldtool.design.margins import margins_of
 from fieldtool.design.moves import TestMove
+from fieldtool.design.no_worse import no_worse, predicted
 from fieldtool.design.nonlinear import notes_of
-from fieldtool.design.predict import AxisPrediction, Prediction, frequencies, predict
+from fieldtool.design.predict import Prediction, frequencies
 from fieldtool.design.robust import SLACK, check
 from fieldtool.design.rule import DesignError, check_masses, lowest_antiresonance
+from fieldtool.design.search import slots_of
 from fieldtool.design.servo import Servo
 from fieldtool.design.shaping import Shaping, best_shaper
+from fieldtool.design.start import slower
 from fieldtool.design.tuning import (
     BOUND,
     MOST_BOUND,
@@ -26,18 +30,13 @@ from fieldtool.design.tuning import (
     Tuning,
     as_parameters,
 )
-from fieldtool.design.uncertainty import samples_of
 from fieldtool.records.model import FloatArray, MachineModel
 
-LONGER = 1.05
-"""Of the present settling time of the motor, or of the time until motor and last mass have arrived: what
-makes new parameters worse."""
-TICK = 0.002
-"""s of settling that nobody notices."""
 TRADE = (0.25, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0)
-SPREAD_OF = 8
-"""Machines that the prediction's spread is over."""
 SEED = 20
+NARROWER = 0.99
+"""Times the bandwidth of a softer response that one has at least."""
+KEPT = "nothing better than the present parameters was found: they are kept."
 SWINGS = 0.25
 """Damping ratio below which a vibration is left to shape."""
 
@@ -98,15 +97,65 @@ def design(
     sides = [DriveSide(axis.name) for axis in model.axes] if sides is None else list(sides)
     moves = default_moves(model, sides) if moves is None else tuple(moves)
     limit = None if top is None else 2 * np.pi * top
-    task = find(model, sides, moves, allowed, limit, seed, advance)
-    advance("round, check and predict", 0.95)
-    chosen = _rounded(task)
-    present = _present(task)
-    kept: dict[int, str] = {}
-    prediction = _predicted(task, chosen)
-    if present is not None:
-        chosen, prediction, kept = _not_worse(task, chosen, prediction, present)
-    return _tuning(task, response, chosen, prediction, present, kept)
+    softer: Softer | None = None
+    names = [name for name in RESPONSES if RESPONSES[name] <= RESPONSES[response]]
+    for k, name in enumerate(names):
+
+        def part(text: str, share: float, k: int = k) -> None:
+            advance(text, (k + share) / len(names))
+
+        room = 1 + (bound - 1) * RESPONSES[name]
+        try:
+            result = _at(find(model, sides, moves, room, limit, seed, part, softer))
+        except DesignError:
+            if name == response:
+                raise
+            continue  # what is softer may ask for too much
+        softer = Softer(
+            result.servos, tuple(axis.margins.bandwidth for axis in result.prediction.axes)
+        )
+    return _tuning(result, response)
+
+
+@dataclass(frozen=True, eq=False)
+class _Result:
+    """What one response came to."""
+
+    task: Task
+    servos: tuple[Servo, ...]
+    """As the drives hold them."""
+    prediction: Prediction
+    kept: frozenset[int]
+    """Axes whose present parameters are kept."""
+
+
+def _at(task: Task) -> _Result:
+    """Return what is written of a task's controllers: rounded, no worse than present and softer ones.
+
+    Raises
+    ------
+    DesignError
+        As :func:`design`.
+    """
+    task.advance("round, check and predict", 0.95)
+    chosen, kept = _rounded(task), frozenset[int]()
+    if task.present is not None:
+        chosen, kept = no_worse(task, chosen, task.present, _rounded)
+    prediction = predicted(task, chosen)
+    softer = task.softer
+    if softer is not None and any(
+        axis.margins.bandwidth < NARROWER * width
+        for axis, width in zip(prediction.axes, softer.bandwidths, strict=True)
+    ):
+        return _Result(task, softer.servos, predicted(task, softer.servos), _same(task, softer))
+    return _Result(task, chosen, prediction, kept)
+
+
+def _same(task: Task, softer: Softer) -> frozenset[int]:
+    """Return the axes of a softer response that keep their present parameters."""
+    present = task.present or ()
+    pairs = enumerate(zip(softer.servos, present, strict=False))
+    return frozenset(k for k, (one, now) in pairs if one == now)
 
 
 def _rounded(task: Task) -> tuple[Servo, ...]:
@@ -144,88 +193,15 @@ def _rounded(task: Task) -> tuple[Servo, ...]:
     )
 
 
-def _present(task: Task) -> tuple[Servo, ...] | None:
-    servos = [side.present_servo for side in task.sides]
-    known = tuple(servo for servo in servos if servo is not None)
-    return known if len(known) == len(servos) else None
-
-
-def _predicted(task: Task, servos: tuple[Servo, ...], spread: bool = True) -> Prediction:
-    rng = np.random.default_rng(SEED)
-    return predict(
-        task.machines[0],
-        servos,
-        task.moves,
-        resolutions=[side.resolution for side in task.sides],
-        samples=[machine_of(m) for m in samples_of(task.model, SPREAD_OF, rng)] if spread else (),
-    )
-
-
-def arrival(axis: AxisPrediction) -> float:
-    """Return when motor and last mass have both arrived, s from the beginning of the move."""
-    if axis.move is None or axis.load is None:
-        return inf
-    return max(axis.move.positioning_time, axis.load.positioning_time)
-
-
-def _not_worse(
-    task: Task, chosen: tuple[Servo, ...], prediction: Prediction, present: tuple[Servo, ...]
-) -> tuple[tuple[Servo, ...], Prediction, dict[int, str]]:
-    """Keep the present parameters where the new ones are slower and the old ones good enough.
-
-    Raises
-    ------
-    DesignError
-        If the new ones are worse all the same.
-    """
-    old = _predicted(task, present, spread=False)
-    if not old.stable:
-        return chosen, prediction, {}
-    kept: dict[int, str] = {}
-    for k, (new, was) in enumerate(zip(prediction.axes, old.axes, strict=True)):
-        if was.margins.sensitivity_peak > task.bound or not _slower(new, was):
-            continue
-        mixed = tuple(present[i] if i in (*kept, k) else s for i, s in enumerate(chosen))
-        if np.all(check(task.machines, mixed).peaks <= SLACK * task.bound):
-            kept[k] = "nothing better than the present parameters was found: they are kept."
-    if kept:
-        chosen = tuple(present[i] if i in kept else s for i, s in enumerate(chosen))
-        prediction = _predicted(task, chosen)
-    for k, (new, was) in enumerate(zip(prediction.axes, old.axes, strict=True)):
-        if k not in kept and was.margins.sensitivity_peak <= task.bound and _slower(new, was):
-            raise DesignError(
-                f"{new.axis}: the new parameters would need {arrival(new):.3g} s for its typical move, "
-                f"the present ones need {arrival(was):.3g} s with a peak of sensitivity of "
-                f"{was.margins.sensitivity_peak:.3g}; nothing is written. Keep the present ones, or try "
-                "--response stiff."
-            )
-    return chosen, prediction, kept
-
-
-def _slower(new: AxisPrediction, was: AxisPrediction) -> bool:
-    if new.move is None or was.move is None:
-        return was.move is not None
-    return (
-        arrival(new) > LONGER * arrival(was)
-        or new.move.settling_time > LONGER * was.move.settling_time + TICK
-    )
-
-
-def _tuning(
-    task: Task,
-    response: str,
-    servos: tuple[Servo, ...],
-    prediction: Prediction,
-    present: tuple[Servo, ...] | None,
-    kept: Mapping[int, str],
-) -> Tuning:
+def _tuning(result: _Result, response: str) -> Tuning:
+    task, servos, prediction, kept = result.task, result.servos, result.prediction, result.kept
     axes = []
     notes = list(notes_of(task.model, servos))
     for k, (side, servo, axis) in enumerate(zip(task.sides, servos, prediction.axes, strict=True)):
         parameters = side.held(as_parameters(servo, side))
         if k in kept and side.present:
             parameters = {n: v for n, v in side.present.items() if n in parameters}
-        reason = kept.get(k) or _reason(task, k, servo)
+        reason = KEPT if k in kept else _reason(task, k, servo)
         axes.append(AxisTuning(side.axis, parameters, axis.margins.sensitivity_peak, reason))
         if side.missing:
             notes.append(
@@ -237,6 +213,9 @@ def _tuning(
             notes.append(
                 f"{side.axis}: its present parameters can not be compared: {side.unreadable}"
             )
+    if kept:
+        names = ", ".join(task.sides[k].axis for k in sorted(kept))
+        notes.append(f"{names}: {KEPT}")
     if task.bound > BOUND:
         notes.append(
             f"The peak of sensitivity may be up to {task.bound:.3g} here, above {BOUND:g}: these "
@@ -248,7 +227,7 @@ def _tuning(
         task.bound,
         task.moves,
         prediction,
-        _predicted(task, present, spread=False) if present else None,
+        predicted(task, task.present, spread=False) if task.present else None,
         _trade(task, servos),
         tuple(_shaping(task, servos, prediction)),
         tuple(dict.fromkeys(notes)),
@@ -259,7 +238,7 @@ def _reason(task: Task, k: int, servo: Servo) -> str:
     axis = task.model.axes[k]
     lowest = lowest_antiresonance(axis) / (2 * np.pi)
     at = f"lowest antiresonance {lowest:.3g} Hz" if np.isfinite(lowest) else "a rigid axis"
-    kinds = ["notch" if f.numerator[0] else "low-pass" for f in servo.loop.filters]
+    kinds = slots_of(servo)
     at_hz = [np.sqrt(f.denominator[1]) / (2 * np.pi) for f in servo.loop.filters]
     filters = ", ".join(f"{kind} at {f:.3g} Hz" for kind, f in zip(kinds, at_hz, strict=True))
     return (

@@ -1,7 +1,7 @@
 """The design: fastest parameters that each drive can hold and that every likely machine bears.
 
-1. Start from the rule (:mod:`fieldtool.design.rule`), or from the present parameters where they keep
-   the margin, lowered until they are stable on every machine looked at.
+1. Start from the best of what is known: the rule (:mod:`fieldtool.design.start`), the present
+   parameters, those of a softer response.
 2. Axis after axis, search structure and numbers (:mod:`fieldtool.design.search`) against the cost of
    :mod:`fieldtool.design.axis_problem`, on several machines at once; then all axes once more.
 3. Check on machines that were not looked at; where too many miss the margin, look at the worst of
@@ -15,16 +15,17 @@ from math import inf, isfinite
 
 import numpy as np
 
-from fieldtool.design.axis_problem import AxisProblem, Bounds, Grids, grids_of
-from fieldtool.design.drive_side import PID, DriveSide
+from fieldtool.design.axis_problem import FAR_GAIN, UNSTABLE, AxisProblem, Bounds, Grids, grids_of
+from fieldtool.design.drive_side import DriveSide
 from fieldtool.design.loops import Loops, system_matrix
 from fieldtool.design.machine import Machine, machine_of, respond
 from fieldtool.design.moves import TestMove, typical_move
 from fieldtool.design.predict import frequencies
 from fieldtool.design.robust import FRESH, MAY_FAIL, check, fresh_check, machines_for, stable_on_all
-from fieldtool.design.rule import DesignError, rule
-from fieldtool.design.search import Best, Space, again, search
+from fieldtool.design.rule import DesignError
+from fieldtool.design.search import Best, again, pruned, refined, search, slots_of
 from fieldtool.design.servo import Servo
+from fieldtool.design.start import MOST_LOWERED, plain_start, slower
 from fieldtool.design.waves import HalfWave
 from fieldtool.records.model import MachineModel
 
@@ -33,15 +34,36 @@ NOISE_SHARE = 0.01
 UNKNOWN_TOP = 3.0
 """Highest frequency that counts as measured, over the highest mode, where nobody says."""
 RIGID_TOP = 2 * np.pi * 30.0
-"""rad/s: the same for a machine without modes."""
+"""rad/s: the same for a machine without modes.  A measurement of rigid axes stays far below it; a mode
+that it did not see at w would have bent the response by (w / mode)^2 of its share."""
 INSIDE = 0.985
 """Of the bound: what the search keeps, so that rounding does not leave it."""
 AGAIN, REPAIRED = 140, 100
 """Evaluations an axis in the second round, and after machines were added."""
-LOWERED, MOST_LOWERED = 0.85, 12
 SAMPLES = 1024
 ROUNDS = 2
 Advance = Callable[[str, float], None]
+
+
+@dataclass(frozen=True)
+class Does:
+    """What an axis' loop does on the machine already: no bound but the margin's asks for less."""
+
+    compliance: float = inf
+    """Largest motor position per torque, rad/(N m) or m/N."""
+    far: float = 0.0
+    """Largest gain of the closed loop beyond the frequencies that were measured."""
+    noise: float = 0.0
+    """RMS of the torque that the encoder's steps make, N m or N."""
+
+
+@dataclass(frozen=True)
+class Softer:
+    """What a softer response came to; this one is to be no slower on any axis."""
+
+    servos: tuple[Servo, ...]
+    bandwidths: tuple[float, ...]
+    """Hz, of the model's machine."""
 
 
 @dataclass(eq=False)
@@ -57,21 +79,45 @@ class Task:
     machines: list[Machine]
     rng: np.random.Generator
     advance: Advance
+    softer: Softer | None = None
+    plain: tuple[Best, ...] = ()
+    """The rule's controllers, without filters: where a search for structure begins."""
     found: list[Best] = field(default_factory=list)
-    softest: list[float] = field(default_factory=list)
-    """Compliance of each axis that new parameters should not exceed."""
+    does: list[Does] = field(default_factory=list)
+    """What each axis' loop does already."""
 
     @property
     def servos(self) -> tuple[Servo, ...]:
         """The best controllers so far."""
         return tuple(best.servo for best in self.found)
 
-    def bounds(self, axis: int, bound: float) -> Bounds:
+    @property
+    def present(self) -> tuple[Servo, ...] | None:
+        """What the drives hold now; None where it can not be read of all of them."""
+        known = tuple(now for side in self.sides if (now := side.present_servo) is not None)
+        return known if len(known) == len(self.sides) else None
+
+    def take(self, servos: Sequence[Servo]) -> None:
+        """Go on from other controllers, as the drives hold them."""
+        self.found = [
+            Best(replace(best.space, slots=slots_of(servo) if side.filters else ()), servo, inf)
+            for best, servo, side in zip(self.plain, servos, self.sides, strict=True)
+        ]
+
+    def bounds(self, axis: int) -> Bounds:
         """Return what one axis has to keep."""
-        side = self.sides[axis]
-        noise = NOISE_SHARE * side.torque_limit
-        soft = self.softest[axis] if self.softest else inf
-        return Bounds(bound, noise, side.torque_limit, side.resolution, self.top, soft)
+        side, does = self.sides[axis], self.does[axis]
+        widths = self.softer.bandwidths if self.softer else (0.0,) * len(self.sides)
+        return Bounds(
+            INSIDE * self.bound,
+            max(NOISE_SHARE * side.torque_limit, does.noise),
+            side.torque_limit,
+            side.resolution,
+            self.top,
+            does.compliance,
+            max(FAR_GAIN, does.far),
+            tuple(2 * np.pi * width for width in widths),
+        )
 
 
 def default_moves(model: MachineModel, sides: Sequence[DriveSide]) -> tuple[TestMove, ...]:
@@ -94,6 +140,7 @@ def find(
     top: float | None,
     seed: int,
     advance: Advance,
+    softer: Softer | None = None,
 ) -> Task:
     """Return the task with the best controllers found, not yet rounded.
 
@@ -107,95 +154,58 @@ def find(
     modes = np.concatenate([machines[0].modes, machines[0].held_modes])
     if top is None:
         top = UNKNOWN_TOP * float(modes.max()) if modes.size else RIGID_TOP
-    task = Task(model, tuple(sides), tuple(moves), bound, top, machines, rng, advance)
+    elif not modes.size:
+        top = max(top, RIGID_TOP)
+    task = Task(model, tuple(sides), tuple(moves), bound, top, machines, rng, advance, softer)
     _start(task)
-    for axis in _order(task):
+    for axis in range(len(task.sides)):
         task.advance(f"design {sides[axis].axis}", axis / len(task.sides))
-        _one(task, axis, INSIDE * bound, first=True)
-    for axis in _order(task):
-        _one(task, axis, INSIDE * bound, first=False)
+        _searched(task, axis)
+    for axis in range(len(task.sides)):
+        improved(task, axis)
     _hold_for_others(task)
     return task
 
 
-def _order(task: Task) -> list[int]:
-    return list(range(len(task.sides)))
-
-
 def _start(task: Task) -> None:
-    """Put in controllers that are stable on every machine."""
-    modes = np.concatenate([task.machines[0].modes, task.machines[0].held_modes])
-    lowest = 0.3 * float(modes.min()) if modes.size else 2 * np.pi
-    for loop, axis, side in zip(rule(task.model), task.model.axes, task.sides, strict=True):
-        highest = 0.8 * np.pi / (side.timing.period or 1e-4)
-        space = Space(side, axis.total_mass, (), lowest, min(highest, 30 * task.top))
-        present = side.present or {}
-        whole = all(name in side.holds for name in PID)
-        share = 1.0 if side.has("velocity_ff") or whole else present.get("velocity_ff", 0.0)
-        inertia = axis.total_mass if side.has("inertia_ff") else present.get("inertia_ff", 0.0)
-        fed = replace(loop, velocity_ff=share, inertia_ff=inertia)
-        servo = side.servo(
-            {"position_p": 1.0, "velocity_p": 1.0, "velocity_i": 1.0}
-            | {f"filter{k}_type": 0.0 for k in side.filters}
-        )
-        corner = servo.velocity_filter
-        if side.has("velocity_filter"):
-            corner = space.highest / (2 * np.pi)
-        kept = servo.loop.filters  # of a drive whose filters can not be set
-        servo = Servo(replace(fed, filters=kept), corner, side.timing)
-        if not kept:
-            servo = space.servo(space.vector(servo), servo)  # within what the drive holds
-        task.found.append(Best(space, servo, inf))
-    for _ in range(MOST_LOWERED):
-        if stable_on_all(task.machines, task.servos):
-            break
-        task.found = [replace(best, servo=slower(best.servo)) for best in task.found]
+    """Put in controllers that are stable on every machine: the best of those that are known."""
+    task.plain = plain_start(task.model, task.sides, task.machines, task.top)
+    task.found = list(task.plain)
+    present = task.present
+    if present is not None and stable_on_all(task.machines, present):
+        task.does = _does(task, present)
     else:
-        raise DesignError(
-            "no gains were found that are stable on every machine that the model's uncertainty allows; "
-            "nothing is written. Measure longer (--time), or give the number of masses with `fieldtool "
-            "identify FOLDER --masses AXIS=N`."
-        )
-    known = tuple(now for side in task.sides if (now := side.present_servo) is not None)
-    plain = len(known) == len(task.sides) and not any(now.loop.filters for now in known)
-    if plain and np.all(check(task.machines, known).peaks <= task.bound):
-        _take_better(task, known)
-    base = known if len(known) == len(task.sides) and stable_on_all(task.machines, known) else None
-    task.softest = _compliances(task.machines[0], base or task.servos)
+        task.does = [replace(one, far=0.0, noise=0.0) for one in _does(task, task.servos)]
+    starts: list[tuple[Servo, ...]] = [task.servos]
+    if task.softer is not None:
+        starts.append(task.softer.servos)
+    if present is not None and np.all(check(task.machines, present).peaks <= task.bound):
+        starts.append(present)
+    if len(starts) > 1:
+        grids = _grids(task)
+        totals = [_total(task, grids, servos) for servos in starts]
+        task.take(starts[int(np.argmin(totals))])
 
 
-def _compliances(machine: Machine, servos: tuple[Servo, ...]) -> list[float]:
-    """Return the largest motor position per torque of each axis."""
+def _does(task: Task, servos: tuple[Servo, ...]) -> list[Does]:
+    """Return what stable loops do on the machine."""
+    machine = task.machines[0]
     values = np.linalg.eigvals(system_matrix(machine, servos)).astype(np.complex128)
-    closed = Loops(respond(machine, frequencies(machine, values)), servos).compliance
-    return [float(np.abs(closed[:, k, k]).max()) for k in range(len(servos))]
+    loops = Loops(respond(machine, frequencies(machine, values)), servos)
+    closed = np.abs(1 - loops.sensitivity[loops.response.omega > task.top])
+    return [
+        Does(
+            float(np.abs(loops.compliance[:, k, k]).max()),
+            float(closed[:, k].max(initial=0.0)),
+            servo.torque_noise(side.resolution) if isfinite(side.resolution) else 0.0,
+        )
+        for k, (servo, side) in enumerate(zip(servos, task.sides, strict=True))
+    ]
 
 
-def _take_better(task: Task, present: tuple[Servo, ...]) -> None:
-    """Begin with the present controllers where together they cost less than the rule's."""
-    grids = _grids(task)
-    costs = []
-    for servos in (task.servos, present):
-        total = 0.0
-        for axis in range(len(task.sides)):
-            total += _problem(task, grids, servos, axis, task.bound).cost(servos[axis])
-        costs.append(total)
-    if costs[1] < costs[0]:
-        task.found = [
-            replace(best, servo=servo) for best, servo in zip(task.found, present, strict=True)
-        ]
-
-
-def slower(servo: Servo, factor: float = LOWERED) -> Servo:
-    """Return a controller with lower gains, its loops as far apart as before."""
-    loop = servo.loop
-    lowered = replace(
-        loop,
-        position_p=loop.position_p * factor,
-        velocity_p=loop.velocity_p * factor,
-        velocity_i=loop.velocity_i * factor**2,
-    )
-    return replace(servo, loop=lowered)
+def _total(task: Task, grids: Grids, servos: tuple[Servo, ...]) -> float:
+    """Return the cost of all axes' controllers."""
+    return sum(_problem(task, grids, servos, axis).cost(servo) for axis, servo in enumerate(servos))
 
 
 def _grids(task: Task) -> Grids:
@@ -211,25 +221,41 @@ def _grids(task: Task) -> Grids:
     return grids_of(task.machines, low, high, HalfWave(duration, SAMPLES))
 
 
-def _problem(
-    task: Task, grids: Grids, servos: tuple[Servo, ...], axis: int, bound: float
-) -> AxisProblem:
+def _problem(task: Task, grids: Grids, servos: tuple[Servo, ...], axis: int) -> AxisProblem:
     side = task.sides[axis]
     free = (side.has("velocity_ff"), side.has("inertia_ff"))
     mass = task.model.axes[axis].total_mass
-    return AxisProblem(grids, servos, axis, task.moves, task.bounds(axis, bound), free, mass)
+    return AxisProblem(grids, servos, axis, task.moves, task.bounds(axis), free, mass)
 
 
-def _one(task: Task, axis: int, bound: float, *, first: bool, evaluations: int = AGAIN) -> None:
-    """Improve one axis; the others stay."""
-    problem = _problem(task, _grids(task), task.servos, axis, bound)
+def _searched(task: Task, axis: int) -> None:
+    """Search structure and numbers of one axis; the others stay."""
+    problem, best = _begun(task, axis)
+    resonances = task.machines[0].modes
+    plain = task.plain[axis]
+    plain = replace(plain, cost=problem.cost(plain.servo))
+    if best.servo == plain.servo:
+        found = search(problem, plain, resonances)
+    else:
+        found = refined(problem, best)
+        if plain.cost < UNSTABLE:
+            found = min(search(problem, plain, resonances), found, key=lambda one: one.cost)
+    _take(task, axis, found)
+
+
+def improved(task: Task, axis: int, evaluations: int = AGAIN) -> None:
+    """Improve the numbers of one axis, and leave out the filters that bring nothing."""
+    problem, best = _begun(task, axis)
+    _take(task, axis, pruned(problem, again(problem, best, evaluations)))
+
+
+def _begun(task: Task, axis: int) -> tuple[AxisProblem, Best]:
+    problem = _problem(task, _grids(task), task.servos, axis)
     best = task.found[axis]
-    best = replace(best, cost=problem.cost(best.servo))
-    found = (
-        search(problem, best, task.machines[0].modes)
-        if first
-        else again(problem, best, evaluations)
-    )
+    return problem, replace(best, cost=problem.cost(best.servo))
+
+
+def _take(task: Task, axis: int, found: Best) -> None:
     tried = [*task.servos]
     tried[axis] = found.servo
     if stable_on_all(task.machines, tuple(tried)):  # what the grid did not see
@@ -252,8 +278,8 @@ def _hold_for_others(task: Task) -> None:
         task.machines += checked.worst(2)
         if not stable_on_all(task.machines, task.servos):
             task.found = [replace(b, servo=slower(b.servo)) for b in task.found]
-        for axis in _order(task):
-            _one(task, axis, INSIDE * task.bound, first=False, evaluations=REPAIRED)
+        for axis in range(len(task.sides)):
+            improved(task, axis, REPAIRED)
     checked = fresh_check(task.model, task.servos, task.rng)
     for _ in range(MOST_LOWERED):
         missed = checked.missed(task.bound)

@@ -19,9 +19,11 @@ DEPTH, POLE_DAMPING = (0.03, 1.0), (0.3, 2.0)
 """Of a notch: damping of the zeros over that of the poles; and that of the poles."""
 WORTH = 0.98
 """Of the cost without it: a filter that does not bring as much is left out."""
-FIRST, ADDED, LAST = 220, 160, 160
-"""Evaluations: without filters, with one more, at the end."""
-SPREAD = 0.4
+LEAST_WORTH = 0.003
+"""Of the move's duration: the same where the cost is about nothing."""
+FIRST, ADDED, LAST, PRUNED = 220, 160, 160, 80
+"""Evaluations: without filters, with one more, at the end, without one of them again."""
+SPREAD, NEAR = 0.4, 0.15
 SCALES = (0.4, 0.7, 1.0, 1.6, 2.5, 4.0)
 """Of position_p and velocity_p where the search begins."""
 NEAR_SCALES = (0.5, 0.75, 1.0, 1.4, 2.0)
@@ -78,7 +80,7 @@ class Space:
         if side.has("velocity_filter"):
             corner = 2 * np.pi * servo.velocity_filter
             out.append(np.log(min(corner, self.highest)))
-        for kind, biquad in zip(self.slots, loop.filters, strict=True):
+        for kind, biquad in zip(self.slots, loop.filters, strict=bool(side.filters)):
             d1, d0 = biquad.denominator
             w = np.sqrt(d0)
             out.append(np.log(w))
@@ -112,13 +114,18 @@ class Space:
             float(ratio * velocity * position),
             template.loop.velocity_ff,
             template.loop.inertia_ff,
-            tuple(filters),
+            tuple(filters) if side.filters else template.loop.filters,
         )
         return Servo(loop, corner, template.timing)
 
     def with_slot(self, kind: str) -> "Space":
         """Return the space with a filter more."""
         return replace(self, slots=(*self.slots, kind))
+
+
+def slots_of(servo: Servo) -> tuple[str, ...]:
+    """Return the kind of each torque filter of a controller."""
+    return tuple(NOTCH if f.numerator[0] else LOW_PASS for f in servo.loop.filters)
 
 
 @dataclass(frozen=True)
@@ -176,28 +183,40 @@ def search(problem: AxisProblem, start: Best, resonances: FloatArray) -> Best:
             for kind, w in _kinds(best, resonances)
         ]
         better = min(tried, key=lambda one: one.cost, default=best)
-        if better.cost > WORTH * best.cost:
+        if better.cost > best.cost - _worth(problem, best):
             break
         best = better
-    return _pruned(problem, improve(problem, best, LAST, 0.5 * SPREAD))
+    return pruned(problem, refined(problem, best))
 
 
-def _pruned(problem: AxisProblem, best: Best) -> Best:
-    """Leave out the filters that bring nothing."""
+def refined(problem: AxisProblem, best: Best) -> Best:
+    """Return a controller at least as good, near to one that is good."""
+    return improve(problem, best, LAST, 0.5 * SPREAD)
+
+
+def pruned(problem: AxisProblem, best: Best) -> Best:
+    """Leave out the filters that bring nothing; the other numbers may make up for them."""
     for k in reversed(range(len(best.space.slots))):
         slots, filters = list(best.space.slots), list(best.servo.loop.filters)
         del slots[k], filters[k]
         loop = replace(best.servo.loop, filters=tuple(filters))
         servo = problem.fed_forward(replace(best.servo, loop=loop))
-        cost = problem.cost(servo)
-        if cost <= best.cost + (1 - WORTH) * abs(best.cost):
-            best = Best(replace(best.space, slots=tuple(slots)), servo, cost)
+        without = Best(replace(best.space, slots=tuple(slots)), servo, problem.cost(servo))
+        if without.cost < UNSTABLE:
+            without = improve(problem, without, PRUNED, NEAR)
+        if without.cost <= best.cost + _worth(problem, best):
+            best = without
     return best
+
+
+def _worth(problem: AxisProblem, best: Best) -> float:
+    """Return what a filter has to bring."""
+    return max((1 - WORTH) * abs(best.cost), LEAST_WORTH * problem.move.duration)
 
 
 def again(problem: AxisProblem, best: Best, evaluations: int) -> Best:
     """Return a controller at least as good, from where it is and from the best of scaled gains."""
-    near = improve(problem, best, evaluations // 2, 0.15)
+    near = improve(problem, best, evaluations // 2, NEAR)
     far = improve(problem, _scaled(problem, near, NEAR_SCALES, itself=False), evaluations)
     return min(near, far, key=lambda one: one.cost)
 

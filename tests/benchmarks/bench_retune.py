@@ -144,11 +144,17 @@ def with_old_gains(data: dict[str, Any], folder: Path) -> tuple[MachineProfile, 
     return machine, ClosedLoop(truth, tuple(loops)).stable
 
 
-def tried(seed: int, number: int) -> dict[str, Any]:
-    """Take one machine the whole way; return what came of it, plain values."""
+def tried(seed: int, number: int, keep: Path | None = None) -> dict[str, Any]:
+    """Take one machine the whole way; return what came of it, plain values.
+
+    ``keep`` is where its session folder stays, for looking at it.
+    """
     rng = np.random.default_rng([seed, number])
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
+        if keep is not None:
+            folder = keep / f"{seed}-{number}"
+            folder.mkdir(parents=True, exist_ok=True)
         os.environ["FIELDTOOL_STATE_DIR"] = str(folder / "notes")
         machine, stable_before = with_old_gains(random_machine(rng), folder)
         row: dict[str, Any] = {
@@ -287,6 +293,8 @@ def main() -> None:
     parser.add_argument("count", type=int, nargs="?", default=6)
     parser.add_argument("--seed", type=int, help="default: a new one")
     parser.add_argument("--out", type=Path, help="JSON lines, appended; default: none kept")
+    parser.add_argument("--only", type=int, nargs="*", help="numbers of these machines alone")
+    parser.add_argument("--keep", type=Path, help="keep session folders here")
     parser.add_argument("--seconds", type=float, default=1e9, help="begin no machine after these")
     arguments = parser.parse_args()
     seed = arguments.seed
@@ -298,10 +306,10 @@ def main() -> None:
     done = {row["number"] for row in rows if row["seed"] == seed}
     print(f"seed {seed}, {len(done)} machines done before", flush=True)
     begun = time.perf_counter()
-    for number in range(arguments.count):
+    for number in arguments.only or range(arguments.count):
         if number in done or time.perf_counter() - begun > arguments.seconds:
             continue
-        row = tried(seed, number)
+        row = tried(seed, number, arguments.keep)
         rows.append(row)
         print(f"  {number}: axes {row['axes']} {row['outcome']} {row['seconds']:.0f} s", flush=True)
         if arguments.out:

@@ -9,12 +9,13 @@ import pytest
 import yaml
 from scipy.linalg import solve_continuous_lyapunov
 
-from fieldtool.design.decide import arrival, design
+from fieldtool.design.decide import design
 from fieldtool.design.design import find
 from fieldtool.design.drive_side import DriveSide, Hold
 from fieldtool.design.loops import Loops, system_matrix
 from fieldtool.design.machine import machine_of, respond
 from fieldtool.design.moves import TestMove
+from fieldtool.design.no_worse import arrival
 from fieldtool.design.predict import frequencies, predict
 from fieldtool.design.robust import check
 from fieldtool.design.rule import DesignError, rule

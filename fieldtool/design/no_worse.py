@@ -1,0 +1,141 @@
+"""New parameters against those that the drives have: an axis that would be slower keeps its own."""
+
+from collections.abc import Callable
+from math import inf
+
+import numpy as np
+
+from fieldtool.design.design import Task, improved
+from fieldtool.design.machine import machine_of
+from fieldtool.design.predict import AxisPrediction, Prediction, predict
+from fieldtool.design.robust import SLACK, check, stable_on_all
+from fieldtool.design.rule import DesignError
+from fieldtool.design.servo import Servo
+from fieldtool.design.uncertainty import samples_of
+
+LONGER = 1.05
+"""Of the present settling time of the motor, or of the time until motor and last mass have arrived: what
+makes new parameters worse."""
+TICK = 0.002
+"""s of settling that nobody notices."""
+SPREAD_OF = 8
+"""Machines that the prediction's spread is over."""
+SPREAD_SEED = 20
+Round = Callable[[Task], tuple[Servo, ...]]
+
+
+def no_worse(
+    task: Task, chosen: tuple[Servo, ...], present: tuple[Servo, ...], rounded: Round
+) -> tuple[tuple[Servo, ...], frozenset[int]]:
+    """Return controllers of which none is slower than what its drive has, and the axes that keep theirs.
+
+    Only present controllers that keep the margin are to be beaten.  The other axes are designed anew
+    round those that are kept, where they do not go with them as they are.
+
+    Parameters
+    ----------
+    task
+        The task; its best controllers change where axes are designed anew.
+    chosen, present
+        New controllers as the drives hold them, and those that are in the drives.
+    rounded
+        What the drives hold of a task's best controllers.
+
+    Raises
+    ------
+    DesignError
+        If new parameters are slower, and the present ones do not keep the margin on all machines.
+    """
+    old = predicted(task, present, spread=False)
+    if not old.stable:
+        return chosen, frozenset()
+    good = [axis.margins.sensitivity_peak <= SLACK * task.bound for axis in old.axes]
+    kept: frozenset[int] = frozenset()
+    while slower := _slower_axes(task, chosen, old, good, kept):
+        kept |= slower
+        mixed = tuple(present[k] if k in kept else one for k, one in enumerate(chosen))
+        if not holds(task, mixed):
+            mixed = _round_these(task, mixed, kept, rounded) or present
+        if mixed == present:
+            if holds(task, present):
+                return present, frozenset(range(len(present)))
+            raise _worse(task, chosen, old, min(slower))
+        chosen = mixed
+    return chosen, kept
+
+
+def _round_these(
+    task: Task, mixed: tuple[Servo, ...], kept: frozenset[int], rounded: Round
+) -> tuple[Servo, ...] | None:
+    """Design the other axes anew; None where that does not come out within the margin."""
+    if len(kept) == len(mixed) or not stable_on_all(task.machines, mixed):
+        return None
+    task.take(mixed)
+    for axis in range(len(mixed)):
+        if axis not in kept:
+            improved(task, axis)
+    try:
+        found = rounded(task)
+    except DesignError:
+        return None
+    found = tuple(mixed[k] if k in kept else one for k, one in enumerate(found))
+    return found if holds(task, found) else None
+
+
+def holds(task: Task, servos: tuple[Servo, ...]) -> bool:
+    """Return whether controllers keep the margin on every machine of the task."""
+    return bool(np.all(check(task.machines, servos).peaks <= SLACK * task.bound))
+
+
+def _slower_axes(
+    task: Task,
+    servos: tuple[Servo, ...],
+    old: Prediction,
+    good: list[bool],
+    kept: frozenset[int],
+) -> frozenset[int]:
+    new = predicted(task, servos, spread=False)
+    return frozenset(
+        k
+        for k, (one, was) in enumerate(zip(new.axes, old.axes, strict=True))
+        if good[k] and k not in kept and slower_than(one, was)
+    )
+
+
+def _worse(task: Task, servos: tuple[Servo, ...], old: Prediction, axis: int) -> DesignError:
+    new, was = predicted(task, servos, spread=False).axes[axis], old.axes[axis]
+    return DesignError(
+        f"{new.axis}: the new parameters would need {arrival(new):.3g} s for its typical move, the "
+        f"present ones need {arrival(was):.3g} s with a peak of sensitivity of "
+        f"{was.margins.sensitivity_peak:.3g}, and do not keep {task.bound:.3g} on every machine that "
+        "the model allows; nothing is written. Keep the present ones, or try --response stiff."
+    )
+
+
+def predicted(task: Task, servos: tuple[Servo, ...], *, spread: bool = True) -> Prediction:
+    """Return what controllers do on the task's machine."""
+    rng = np.random.default_rng(SPREAD_SEED)
+    return predict(
+        task.machines[0],
+        servos,
+        task.moves,
+        resolutions=[side.resolution for side in task.sides],
+        samples=[machine_of(m) for m in samples_of(task.model, SPREAD_OF, rng)] if spread else (),
+    )
+
+
+def arrival(axis: AxisPrediction) -> float:
+    """Return when motor and last mass have both arrived, s from the beginning of the move."""
+    if axis.move is None or axis.load is None:
+        return inf
+    return max(axis.move.positioning_time, axis.load.positioning_time)
+
+
+def slower_than(new: AxisPrediction, was: AxisPrediction) -> bool:
+    """Return whether an axis arrives or settles later than it did, by more than anybody would take."""
+    if new.move is None or was.move is None:
+        return was.move is not None
+    return (
+        arrival(new) > LONGER * arrival(was)
+        or new.move.settling_time > LONGER * was.move.settling_time + TICK
+    )
