@@ -15,8 +15,9 @@ from math import inf, isfinite
 
 import numpy as np
 
-from fieldtool.design.axis_problem import FAR_GAIN, UNSTABLE, AxisProblem, Bounds, Grids, grids_of
+from fieldtool.design.axis_problem import UNSTABLE, AxisProblem
 from fieldtool.design.drive_side import DriveSide
+from fieldtool.design.grids import FAR_GAIN, Bounds, Grids, grids_of
 from fieldtool.design.loops import Loops, system_matrix
 from fieldtool.design.machine import Machine, machine_of, respond
 from fieldtool.design.moves import TestMove, typical_move

@@ -61,11 +61,16 @@ class Loops:
             Position of the axis' motor and of its last mass, and the torque that its drive gives,
             shape (F,).
         """
+        motors, torques = self.moved(axis, drive)
+        load = np.einsum("fk,fk->f", self.response.loads[:, axis, :], torques)
+        return motors[:, axis], load, torques[:, axis]
+
+    def moved(self, axis: int, drive: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
+        """Return the positions of all motors, and the torques of all drives, (F, M), as above."""
         motors = self.compliance[:, :, axis] * drive[:, None]
         torques = -self.gains * motors
         torques[:, axis] += drive
-        load = np.einsum("fk,fk->f", self.response.loads[:, axis, :], torques)
-        return motors[:, axis], load, torques[:, axis]
+        return motors, torques
 
 
 def stable(machine: Machine, servos: tuple[Servo, ...]) -> bool:
@@ -78,7 +83,12 @@ def stable(machine: Machine, servos: tuple[Servo, ...]) -> bool:
 
 
 def system_matrix(machine: Machine, servos: tuple[Servo, ...]) -> FloatArray:
-    """Return A of x' = A x with all references at rest.
+    """Return A of x' = A x with all references at rest, as :func:`state_space` has it."""
+    return state_space(machine, servos)[0]
+
+
+def state_space(machine: Machine, servos: tuple[Servo, ...]) -> tuple[FloatArray, FloatArray]:
+    """Return A of x' = A x with all references at rest, and the rows of the motors' torques, (M, N).
 
     State: positions, velocities; then for each axis the velocity's delay and filter, the
     integrator, two states a torque filter, two of the delay and one of the motor's lag, where there
@@ -93,11 +103,13 @@ def system_matrix(machine: Machine, servos: tuple[Servo, ...]) -> FloatArray:
     a[n : 2 * n, :n] = -inverse @ machine.stiffness
     a[n : 2 * n, n : 2 * n] = -inverse @ (machine.damping + _viscous(machine))
     place = 2 * n
+    torques = []
     for k, servo in enumerate(servos):
         row, used = _controller(a, place, int(machine.motors[k]), n, servo, float(machine.lag[k]))
         a[n : 2 * n] += machine.scale[k] * np.outer(inverse[:, machine.motors[k]], row)
+        torques.append(row)
         place += used
-    return a
+    return a, np.stack(torques)
 
 
 def _viscous(machine: Machine) -> FloatArray:

@@ -11,8 +11,25 @@ from scipy.linalg import eigh
 from fieldtool.records.model import FloatArray, MachineModel
 
 ComplexArray = NDArray[np.complexfloating[Any, Any]]
+DRY = ("coulomb_friction", "stribeck_friction", "asymmetric_friction")
 RIGID = 1e-9
 """Of the largest eigenvalue: below it a mode is rigid motion."""
+
+
+@dataclass(frozen=True)
+class Dry:
+    """Dry friction between a mass and ground."""
+
+    place: int
+    """Degree of freedom."""
+    forward: float
+    """Torque or force against a motion forward, N m or N, at least 0."""
+    backward: float
+    """The same against a motion backward."""
+    extra: float = 0.0
+    """What breakaway takes more than sliding."""
+    velocity: float = 1.0
+    """At which that has fallen to 1 / e of it, rad/s or m/s."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +53,8 @@ class Machine:
     """(M,) s: first-order lag from the reported torque to that of the motor."""
     delay: FloatArray
     """(M,) s: by which a position is measured later than torque."""
+    dry: tuple[Dry, ...] = ()
+    """Dry friction, which no response in frequency has."""
 
     @property
     def modes(self) -> FloatArray:
@@ -75,7 +94,8 @@ def machine_of(model: MachineModel) -> Machine:
 
     ``extra_mode, coupling_spring, coupling_inertia, stiffness_change, structural_damping,
     asymmetric_friction`` (its viscous part), ``torque_scale, torque_lag, measurement_delay`` are in;
-    the others have no linear part (:mod:`fieldtool.design.nonlinear` says what they do).
+    the others have no linear part (:mod:`fieldtool.design.nonlinear` says what they do).  Dry friction
+    stands beside the matrices.
     """
     m = len(model.axes)
     parts = _Parts(model)
@@ -92,7 +112,28 @@ def machine_of(model: MachineModel) -> Machine:
         parts.of_axis("torque_scale", "scale", 1.0, m),
         np.maximum(parts.of_axis("torque_lag", "time", 0.0, m), 0.0),
         np.maximum(parts.of_axis("measurement_delay", "delay", 0.0, m), 0.0),
+        tuple(dry for effect in model.effects if (dry := _dry(model, effect)) is not None),
     )
+
+
+def _dry(model: MachineModel, effect: Mapping[str, Any]) -> Dry | None:
+    """Return the dry friction that an effect is; None where it is none."""
+    kind, name = effect.get("effect"), effect.get("axis")
+    if kind not in DRY or name not in model.names:
+        return None
+    places = model.last_masses if effect.get("location") == "load" else model.first_masses
+    torque = max(number(effect, "torque"), 0.0)
+    forward, backward, extra, velocity = torque, torque, 0.0, 1.0
+    if kind == "stribeck_friction":
+        extra = max(number(effect, "breakaway") - torque, 0.0)
+        velocity = number(effect, "velocity")
+    elif kind == "asymmetric_friction":
+        forward = max(number(effect, "coulomb_positive"), 0.0)
+        backward = max(number(effect, "coulomb_negative"), 0.0)
+    if max(forward, backward, extra) <= 0:
+        return None
+    place = int(places[model.names.index(str(name))])
+    return Dry(place, forward, backward, extra, velocity if velocity > 0 else 1.0)
 
 
 def respond(machine: Machine, omega: FloatArray) -> Response:

@@ -3,11 +3,9 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from fieldtool.design.machine import number
+from fieldtool.design.machine import DRY, number
 from fieldtool.design.servo import Servo
 from fieldtool.records.model import MachineModel
-
-DRY = ("coulomb_friction", "stribeck_friction", "asymmetric_friction")
 
 
 def notes_of(model: MachineModel, servos: Sequence[Servo]) -> list[str]:
@@ -58,5 +56,5 @@ def _friction(name: str, effect: Mapping[str, Any], servo: Servo, unit: str) -> 
     return [
         f"{name}: dry friction of {torque:.3g} may hold the motor up to {away:.3g} {unit} off its "
         f"target for about {loop.velocity_p / loop.velocity_i:.2g} s, and then let it creep or hunt; "
-        "settling will take longer than predicted where the band is smaller than that."
+        "what is predicted of moves has it in."
     ]

@@ -8,19 +8,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fieldtool.design.figures import (
-    MoveFigures,
-    StepFigures,
-    move_figures,
-    sensitivity_peak,
-    step_figures,
-)
+from fieldtool.design.figures import MoveFigures, StepFigures, sensitivity_peak
 from fieldtool.design.loops import Loops, system_matrix
 from fieldtool.design.machine import Machine, machine_of, respond
 from fieldtool.design.margins import Margins, margins_of
+from fieldtool.design.motion import Curves, moved
 from fieldtool.design.moves import TestMove
 from fieldtool.design.servo import Servo
-from fieldtool.design.waves import HalfWave
 from fieldtool.records.model import FloatArray, MachineModel
 
 ComplexArray = NDArray[np.complexfloating[Any, Any]]
@@ -28,36 +22,8 @@ GRID = 400
 BESIDE = np.linspace(-2.5, 2.5, 13)
 LIGHT = 0.3
 """Damping ratio below which an eigenvalue gets frequencies of its own."""
-DECAYS = 6.0
-"""Time constants after which a response has come to rest."""
-MOST_SAMPLES = 2**14
-LONGEST = 60.0
-"""s: no response is looked at for longer."""
 SPREAD = (2.5, 97.5)
 """Percentiles of what is told of uncertain models."""
-
-
-@dataclass(frozen=True, eq=False)
-class Curves:
-    """Histories of one axis, for pictures and comparison."""
-
-    time: FloatArray
-    """s."""
-    reference: FloatArray
-    """Of the move, rad or m, from 0."""
-    position: FloatArray
-    """Motor."""
-    load: FloatArray
-    """Last mass."""
-    torque: FloatArray
-    """N m or N."""
-    step_time: FloatArray
-    frequency: FloatArray
-    """Hz."""
-    sensitivity: FloatArray
-    """abs(1 / (1 + L)) of the axis' loop with all others closed."""
-    step: FloatArray
-    """Motor after a unit step of the reference, without feed-forward."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,6 +50,8 @@ class AxisPrediction:
     """95 % ranges over the model's uncertainty: sensitivity_peak, settling_time, positioning_time,
     overshoot (of the motor); empty where no samples were given."""
     curves: Curves | None = None
+    sensitivity: tuple[FloatArray, FloatArray] | None = None
+    """Hz and abs(1 / (1 + L)) of the axis' loop with all others closed, for pictures."""
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values without the histories; what is infinite or not known is null."""
@@ -168,20 +136,20 @@ def predict(
     axes = []
     spreads = _spreads(samples, servos, moves) if steady and samples else [{} for _ in servos]
     for k, (servo, move) in enumerate(zip(servos, moves, strict=True)):
-        seen = (loops.response.omega / (2 * np.pi), np.abs(loops.sensitivity[:, k]))
-        moved = _moved(machine, servos, k, move, values, seen) if steady else None
+        motion = moved(machine, servos, k, move, values) if steady else None
         axes.append(
             AxisPrediction(
                 machine.names[k],
                 margins_of(loops.response.omega, loops.sensitivity[:, k]),
-                moved.motor if moved else None,
-                moved.load if moved else None,
-                moved.step if moved else None,
+                motion.motor if motion else None,
+                motion.load if motion else None,
+                motion.step if motion else None,
                 float(np.abs(loops.compliance[:, k, k]).max()),
                 _noise(servo, steps[k]),
-                moved.peak_torque if moved else nan,
+                motion.peak_torque if motion else nan,
                 spreads[k],
-                moved.curves if moved else None,
+                motion.curves if motion else None,
+                (loops.response.omega / (2 * np.pi), np.abs(loops.sensitivity[:, k])),
             )
         )
     peak = sensitivity_peak(loops.input_sensitivity) if steady else inf
@@ -215,65 +183,6 @@ def frequencies(machine: Machine, eigenvalues: ComplexArray) -> FloatArray:
     beside = (open_modes[:, None] * (1 + 0.004 * BESIDE)).ravel()
     every = np.concatenate([np.geomspace(low, high, GRID), near, beside])
     return np.unique(every[every > 0])
-
-
-@dataclass(frozen=True, eq=False)
-class _Moved:
-    motor: MoveFigures
-    load: MoveFigures
-    step: StepFigures
-    peak_torque: float
-    curves: Curves
-
-
-def _wave(values: ComplexArray, beyond: float, shortest: float) -> HalfWave:
-    """Return samples for a response of a machine with these eigenvalues.
-
-    Parameters
-    ----------
-    values
-        Eigenvalues, rad/s.
-    beyond
-        s, of the reference.
-    shortest
-        s: no sample is longer.
-    """
-    duration = beyond + min(DECAYS / max(-float(values.real.max()), 1e-6), LONGEST)
-    matters = np.abs(values)[-values.real < 1e3 / duration + 20 / beyond]
-    fastest = float(matters.max()) if matters.size else 1 / shortest
-    step = min(shortest, 0.5 / fastest)
-    samples = 2 ** int(np.ceil(np.log2(min(max(duration / step, 256), MOST_SAMPLES))))
-    return HalfWave(duration, samples)
-
-
-def _moved(
-    machine: Machine,
-    servos: tuple[Servo, ...],
-    axis: int,
-    move: TestMove,
-    values: ComplexArray,
-    seen: tuple[FloatArray, FloatArray],
-) -> _Moved:
-    wave = _wave(values, move.duration, move.duration / 200)
-    drive = wave.spectrum(wave.move(move))
-    loops = Loops(respond(machine, wave.omega), servos)
-    s = 1j * wave.omega
-    motor, load, torque = (
-        wave.signal(one) for one in loops.motion(axis, servos[axis].reference_gain(s) * drive)
-    )
-    step = wave.spectrum(wave.step(1.0))
-    stepped = wave.signal(loops.motion(axis, servos[axis].step_gain(s) * step)[0]) + 0.5
-    half, time = 0.5 * move.distance, wave.time
-    reference = move.at(time)[0]
-    band = move.settling_band
-    curves = Curves(time, reference, motor + half, load + half, torque, time, *seen, stepped)
-    return _Moved(
-        move_figures(time, reference, curves.position, band),
-        move_figures(time, reference, curves.load, band),
-        step_figures(time, stepped, 1.0),
-        float(np.abs(torque).max()),
-        curves,
-    )
 
 
 def _spreads(

@@ -140,6 +140,39 @@ def _rates(period: float) -> tuple[FloatArray, ComplexArray, ComplexArray]:
     return omega, s, (1 - np.exp(-period * s)) / period
 
 
+@dataclass(frozen=True, eq=False)
+class Sampled:
+    """A drive's controller at fixed frequencies, its delays computed once."""
+
+    s: ComplexArray
+    delay: ComplexArray
+    velocity: ComplexArray
+    """s times the velocity's delay."""
+    acceleration: ComplexArray
+    """s^2 times what holding the acceleration does."""
+
+    @classmethod
+    def of(cls, s: ComplexArray, timing: Timing) -> "Sampled":
+        """Return what all controllers with this timing have in common at complex frequencies, rad/s."""
+        bare = Servo(AxisLoop(1.0, 1.0, 0.0, 0.0, 1.0), OFF, timing)
+        late = np.exp(-timing.lag * s)
+        # inertia alone: reference_gain less position_p velocity_p
+        held = bare.reference_gain(s) / late - 1.0
+        return cls(s, late, s * np.exp(-0.5 * timing.period * s), held)
+
+    def gain(self, servo: Servo) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
+        """Return torque per position error, its filters with the delay, and those with the PI."""
+        loop, s = servo.loop, self.s
+        torque = self.delay
+        for biquad in loop.filters:
+            torque = torque * biquad.response(s)
+        pi = torque * (loop.velocity_p + loop.velocity_i / s)
+        rate = self.velocity
+        if servo.velocity_filter != OFF:
+            rate = rate / (1 + s / (2 * np.pi * servo.velocity_filter))
+        return pi * (loop.position_p + rate), torque, pi
+
+
 def servo_from_parameters(values: Mapping[str, float], timing: Timing) -> Servo:
     """Return the controller that a drive's parameters describe.
 

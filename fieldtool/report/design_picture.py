@@ -58,10 +58,11 @@ def _sensitivity(
     plot: Axes, before: AxisPrediction | None, after: AxisPrediction, bound: float
 ) -> None:
     for one, colour, name in ((before, BEFORE, "before"), (after, AFTER, "designed")):
-        if one is not None and one.curves is not None:
+        if one is not None and one.sensitivity is not None:
+            frequency, size = one.sensitivity
             plot.semilogx(
-                one.curves.frequency,
-                20 * np.log10(np.maximum(one.curves.sensitivity, 1e-4)),
+                frequency,
+                20 * np.log10(np.maximum(size, 1e-4)),
                 color=colour,
                 label=name,
                 lw=1.4,

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -96,6 +97,48 @@ def test_within_the_bound_on_the_true_machine(
     assert total[1] <= 1.25 * total[0]
     stiffer = [b.compliance / a.compliance for a, b in zip(old.axes, new.axes, strict=True)]
     assert min(stiffer) < 0.9
+
+
+@pytest.mark.parametrize("lengths", [(1,), (3,), (2, 1)], ids=str)
+def test_a_stiffer_response_is_never_slower(
+    lengths: tuple[int, ...], random_model: RandomModel, fresh_rng: np.random.Generator
+) -> None:
+    model = random_model(fresh_rng, lengths)
+    widths = []
+    for response in ("soft", "normal", "stiff"):
+        prediction = design(model, sides_of(model), response=response).prediction
+        assert prediction is not None
+        widths.append([axis.margins.bandwidth for axis in prediction.axes])
+    for softer, stiffer in pairwise(np.array(widths)):
+        assert np.all(stiffer >= 0.99 * softer)
+
+
+def test_an_axis_that_can_not_be_improved_keeps_its_own_and_the_others_are_designed(
+    random_model: RandomModel,
+) -> None:
+    model = random_model(np.random.default_rng(8), (2, 2))
+    first = design(model, sides_of(model), response="stiff")
+    sides = sides_of(model, [Servo(loop) for loop in rule(model)])
+    best = first.axes[0].parameters
+    narrow = {"velocity_p": Hold(maximum=0.3 * best["velocity_p"])}  # below what it holds now
+    sides[0] = replace(sides[0], present=best, holds=narrow, tunable=frozenset(best))
+    tuning = design(model, sides, response="stiff")
+    assert tuning.axes[0].parameters == best
+    assert any(note.startswith("axis1: nothing better") for note in tuning.notes)
+    assert tuning.prediction is not None
+    assert tuning.present is not None
+    assert arrival(tuning.prediction.axes[1]) < 0.95 * arrival(tuning.present.axes[1])
+    assert max(a.margins.sensitivity_peak for a in tuning.prediction.axes) <= 2.0 * 1.02
+
+
+def test_filters_of_a_drive_that_can_not_set_them_stay(random_model: RandomModel) -> None:
+    model = random_model(np.random.default_rng(9), (2,))
+    (side,) = sides_of(model, [Servo(loop) for loop in rule(model)])
+    fixed = {"filter1_type": 2.0, "filter1_frequency": 180.0, "filter1_pole_damping": 0.7}
+    names = frozenset({"position_p", "velocity_p", "velocity_i"})
+    tuning = design(model, [replace(side, tunable=names, present={**side.present, **fixed})])
+    assert set(tuning.axes[0].parameters) == names
+    assert "low-pass at 180 Hz" in tuning.axes[0].reason
 
 
 def test_the_three_responses_keep_their_margins(

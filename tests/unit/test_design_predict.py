@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
+from drives.sim.effects import CoulombFriction
 from drives.sim.firmware import DriveHardware, Parameter, SimulatedAxes
 from drives.sim.plant import ChainParameters, PlantParameters
 from fieldtool.design.decide import design
 from fieldtool.design.drive_side import DriveSide
+from fieldtool.design.figures import move_figures
 from fieldtool.design.loops import Loops, stable, system_matrix
 from fieldtool.design.machine import machine_of, respond
 from fieldtool.design.margins import margins_of
@@ -25,11 +27,17 @@ RandomModel = Callable[..., MachineModel]
 LENGTHS = [(1,), (2,), (3,), (2, 1), (1, 3), (2, 3, 1)]
 
 
-def plant_of(model):
-    """The simulated machine of the same values."""
+def plant_of(model, friction=None):
+    """The simulated machine of the same values, with dry friction at (axis, place) if wanted."""
+    friction = friction or {}
     chains = tuple(
         ChainParameters(
-            *(tuple(e.value for e in part) for part in (a.masses, a.springs, a.dampers))
+            *(tuple(e.value for e in part) for part in (a.masses, a.springs, a.dampers)),
+            effects=tuple(
+                CoulombFriction(torque, place)
+                for (axis, place), torque in friction.items()
+                if axis == a.name
+            ),
         )
         for a in model.axes
     )
@@ -132,6 +140,43 @@ def test_the_delay_of_the_state_space_is_that_of_the_frequency_response() -> Non
         assert by_time == pytest.approx(by_frequency, abs=1e-3)
 
 
+def cascades_of(model: MachineModel, rng: np.random.Generator) -> list[dict[str, float]]:
+    return [
+        {
+            "position_p": loop.position_p,
+            "velocity_p": loop.velocity_p,
+            "velocity_i": loop.velocity_i,
+            "velocity_ff": 1.0,
+            "inertia_ff": 0.7 * loop.inertia_ff,
+            "velocity_filter": float(rng.uniform(40, 400)),
+            "filter1_type": 2.0,
+            "filter1_frequency": float(rng.uniform(60, 200)),
+            "filter1_zero_damping": 0.1,
+            "filter1_pole_damping": 0.7,
+        }
+        for loop in rule(model)
+    ]
+
+
+def moved_by_firmware(plant, values, k: int, targets, cycle: float, rate: float):
+    """Motor positions of axis k, cycle by cycle, while its targets are sent; the others stand."""
+    hardware = DriveHardware(1000.0, 0.0, 2**23 / (2 * np.pi))
+    axes = SimulatedAxes(plant, [hardware] * len(values), 1, rate)
+    for i, one in enumerate(values):
+        for name, value in one.items():
+            axes.set(i, Parameter[name.upper()], value)
+        axes.follow_position(i, 0.0, 32)
+    position = np.zeros(targets.size)
+    for n in range(targets.size):
+        position[n] = axes.position(k)
+        # a target is reached a cycle after it was sent
+        for i in range(len(values)):
+            target = targets[min(n + 1, targets.size - 1)] if i == k else 0.0
+            axes.follow_position(i, target, 32)
+        axes.advance(32)
+    return position
+
+
 @pytest.mark.parametrize("lengths", [(1,), (2,), (2, 1), (2, 3)], ids=str)
 def test_simulated_firmware_does_as_predicted(
     lengths: tuple[int, ...], random_model: RandomModel, fresh_rng: np.random.Generator
@@ -139,48 +184,66 @@ def test_simulated_firmware_does_as_predicted(
     """Sampled loops, rounded positions, stairs of torque: the figures are those predicted."""
     model = random_model(fresh_rng, lengths)
     cycle, rate = 0.004, 8000.0
-    values = [
-        {
-            "position_p": loop.position_p,
-            "velocity_p": loop.velocity_p,
-            "velocity_i": loop.velocity_i,
-            "velocity_ff": 1.0,
-            "inertia_ff": 0.7 * loop.inertia_ff,
-            "velocity_filter": float(fresh_rng.uniform(40, 400)),
-            "filter1_type": 2.0,
-            "filter1_frequency": float(fresh_rng.uniform(60, 200)),
-            "filter1_zero_damping": 0.1,
-            "filter1_pole_damping": 0.7,
-        }
-        for loop in rule(model)
-    ]
+    values = cascades_of(model, fresh_rng)
+    timing = Timing(0.22e-3, 1 / rate, cycle)
+    found = predict(model, [servo_from_parameters(v, timing) for v in values], moves_of(model))
+    if not found.stable:
+        pytest.skip("a random filter makes this machine unstable")
+    k = int(fresh_rng.integers(len(lengths)))
+    curves = found.axes[k].curves
+    t = np.arange(int(curves.time[-1] / cycle)) * cycle
+    targets = moves_of(model)[k].at(t)[0]
+    position = moved_by_firmware(plant_of(model), values, k, targets, cycle, rate)
+    expected = np.interp(t, curves.time, curves.position)
+    size = found.axes[k].move.following_error
+    assert position == pytest.approx(expected, abs=0.03 * size + 1e-5)
+
+
+@pytest.mark.parametrize("lengths", [(1,), (2,), (3, 1)], ids=str)
+def test_dry_friction_is_in_what_is_predicted_of_moves(
+    lengths: tuple[int, ...], random_model: RandomModel, fresh_rng: np.random.Generator
+) -> None:
+    """Out and back in the simulated firmware with exact sticking, against time stepping in the model."""
+    model = random_model(fresh_rng, lengths)
+    cycle, rate = 0.004, 8000.0
+    values = cascades_of(model, fresh_rng)
+    for one in values:
+        one["filter1_type"] = 0.0
     timing = Timing(0.22e-3, 1 / rate, cycle)
     servos = [servo_from_parameters(v, timing) for v in values]
     moves = moves_of(model)
-    found = predict(model, servos, moves)
-    if not found.stable:
-        pytest.skip("a random filter makes this machine unstable")
-    hardware = DriveHardware(1000.0, 0.0, 2**23 / (2 * np.pi))
+    friction = {
+        (axis.name, place): float(fresh_rng.uniform(0.02, 0.2))
+        * move.acceleration
+        * axis.total_mass
+        for axis, move in zip(model.axes, moves, strict=True)
+        for place in (["motor", "load"] if len(axis.masses) > 1 else ["motor"])
+    }
+    effects = tuple(
+        {"effect": "coulomb_friction", "axis": name, "location": place,
+         "parameters": {"torque": {"value": torque, "std": None, "unit": "N m"}}}
+        for (name, place), torque in friction.items()
+    )  # fmt: skip
+    found = predict(replace(model, effects=effects), servos, moves)
+    smooth = predict(model, servos, moves)
     k = int(fresh_rng.integers(len(lengths)))
-    axes = SimulatedAxes(plant_of(model), [hardware] * len(lengths), 1, rate)
-    for i, one in enumerate(values):
-        for name, value in one.items():
-            axes.set(i, Parameter[name.upper()], value)
-        axes.follow_position(i, 0.0, 32)
-    targets = moves[k].reference(cycle)
-    count = int(found.axes[k].curves.time[-1] / cycle)
-    position = np.zeros(count)
-    for n in range(count):
-        position[n] = axes.position(k)
-        # a target is reached a cycle after it was sent
-        for i in range(len(lengths)):
-            target = targets[min(n + 1, targets.size - 1)] if i == k else 0.0
-            axes.follow_position(i, target, 32)
-        axes.advance(32)
-    t = np.arange(count) * cycle
-    expected = np.interp(t, found.axes[k].curves.time, found.axes[k].curves.position)
-    size = found.axes[k].move.following_error
-    assert position == pytest.approx(expected, abs=0.03 * size + 1e-5)
+    curves, move = found.axes[k].curves, found.axes[k].move
+    t = np.arange(int(curves.time[-1] / cycle)) * cycle
+    out = moves[k].at(t)[0]
+    targets = np.concatenate([out, out[-1] - out])
+    position = moved_by_firmware(plant_of(model, friction), values, k, targets, cycle, rate)
+    expected = np.interp(t, curves.time, curves.position)
+    plain = np.interp(t, smooth.axes[k].curves.time, smooth.axes[k].curves.position)
+    apart = np.abs(position[: t.size] - expected).max()
+    assert apart <= 0.03 * move.following_error + 1e-5
+    assert np.abs(position[: t.size] - plain).max() > 2 * apart  # the friction matters
+    band = moves[k].settling_band
+    measured = [
+        move_figures(t, out, position[: t.size], band),
+        move_figures(t, out, out[-1] - position[t.size :], band),
+    ]
+    worst = max(one.following_error for one in measured)
+    assert move.following_error == pytest.approx(worst, rel=0.05)
 
 
 def test_noise_of_an_encoder_as_the_firmware_makes_it() -> None:

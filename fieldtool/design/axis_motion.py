@@ -1,0 +1,192 @@
+"""An axis' own move, and those of the others, under a choice of its parameters: part of the cost.
+
+With all other loops closed and T the compliance with this loop open, motor and last mass follow from one
+loop; so do the moves of the others.  All signals are half-waves (:mod:`fieldtool.design.waves`).
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from math import isfinite
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fieldtool.design.grids import Bounds, ComplexArray, Grids, closed_compliance, without
+from fieldtool.design.moves import TestMove
+from fieldtool.design.servo import Sampled, Servo
+from fieldtool.design.waves import HalfWave
+from fieldtool.records.model import FloatArray
+
+DISTURBANCE = 0.2
+"""Of the torque that the move takes on a rigid axis: a step of it is to be held down."""
+STIFFNESS = 0.05
+"""Cost of the logarithm of what a disturbance leaves, in durations of the move."""
+INNER_BAND = 0.6
+"""Of the band: where the search wants an axis to be, so that it is in the band for sure."""
+MOVED = 2.0
+"""Weight of the axis' own move beside those of the others."""
+DURING = 0.05
+"""Weight of the following error before the move has ended, for the feed-forward."""
+MOST_FED = np.array([1.0, 1.3])
+"""Velocity feed-forward, and inertia feed-forward over the axis' own inertia, at most."""
+FED_NOISE = 3.0
+"""RMS of the torque that rounded targets make by inertia feed-forward, over that allowed of the
+encoder's steps."""
+
+
+class AxisMotion:
+    """One axis' move, the loops of all others being given; arguments as those of the problem."""
+
+    def __init__(
+        self,
+        grids: Grids,
+        servos: Sequence[Servo],
+        axis: int,
+        moves: Sequence[TestMove],
+        bounds: Bounds,
+        free: tuple[bool, bool],
+        mass: float,
+    ) -> None:
+        self.bounds, self.move, self.free, self.mass = bounds, moves[axis], free, mass
+        others = [i for i in range(len(servos)) if i != axis]
+        wave, s = grids.wave, 1j * grids.wave.omega
+        self._wave, self._tick = wave, wave.duration / wave.samples
+        self._slow = Sampled.of(s, servos[axis].timing)
+        gains = without(np.stack([servo.gain(s) for servo in servos], axis=-1), axis)
+        closed = closed_compliance(grids.slow, gains)
+        loads = grids.loads - np.einsum("wij,wj,wjk->wik", grids.loads, gains, closed)
+        self._motor, self._load = closed[:, axis, axis], loads[:, axis, axis]
+        self._target = wave.spectrum(wave.move(self.move))
+        self._step = wave.spectrum(wave.step(DISTURBANCE * self.mass * self.move.acceleration))
+        self._wanted = wave.move(self.move)
+        self._drag = self._dragged(grids, wave, (axis, closed, loads))
+        self._begin = int(np.searchsorted(wave.time, self.move.duration))
+        self._weight = np.where(wave.time >= self.move.duration, 1.0, DURING)
+        # position = there - back C S, for motor and last mass of every other axis on its own move
+        self._others = []
+        for i in others:
+            wanted = wave.move(moves[i])
+            drive = servos[i].reference_gain(s) * wave.spectrum(wanted)
+            begin = int(np.searchsorted(wave.time, moves[i].duration))
+            band = INNER_BAND * moves[i].settling_band
+            for what in (closed, loads):
+                there, back = what[:, i, i] * drive, what[:, i, axis] * closed[:, axis, i] * drive
+                self._others.append((there, back, wanted[begin:], begin, band))
+
+    def _dragged(
+        self, grids: Grids, wave: HalfWave, inner: tuple[int, ComplexArray, ComplexArray]
+    ) -> tuple[ComplexArray, ComplexArray] | None:
+        """Return what the axis' dry friction does to motor and last mass before its loop is closed.
+
+        As a torque against the direction of the reference's velocity: what an integrator has to learn
+        when the move begins, and to forget when it ends.  None where there is none.
+        """
+        axis, closed, loads = inner
+        machine = grids.machines[0]
+        torque = sum(
+            0.5 * (dry.forward + dry.backward)
+            for dry in machine.dry
+            if dry.place in (machine.motors[axis], machine.loads[axis])
+        )
+        if torque <= 0:
+            return None
+        moving = np.sign(np.round(self.move.at(wave.time)[1] / self.move.velocity, 9))
+        force = wave.spectrum(-torque * moving)
+        return closed[:, axis, axis] * force, loads[:, axis, axis] * force
+
+    def fed_forward(self, servo: Servo) -> Servo:
+        """Return a controller with the feed-forward that fits its feedback best."""
+        gain, torque, pi = self._slow.gain(servo)
+        share, inertia = self._feed_forward(servo, 1 / (1 + gain * self._motor), torque, pi)[0]
+        loop = replace(servo.loop, velocity_ff=share, inertia_ff=inertia)
+        return replace(servo, loop=loop)
+
+    def _feed_forward(
+        self, servo: Servo, sensitivity: ComplexArray, torque: ComplexArray, pi: ComplexArray
+    ) -> tuple[tuple[float, float], tuple[FloatArray, FloatArray], ComplexArray]:
+        """Return the shares, errors of motor and last mass on the move, and the torque's phasors.
+
+        Shares are those of least squares over the time after the move, and a little before it.
+        """
+        wave, drive = self._wave, self._target * sensitivity
+        parts = [pi * servo.loop.position_p * drive]
+        parts.append(pi * self._slow.s * drive)
+        parts.append(torque * self._slow.acceleration * drive * self.mass)
+        signals = [[wave.signal(plant * part) for part in parts] for plant in self._plants]
+        if self._drag is not None:
+            for one, dragged in zip(signals, self._drag, strict=True):
+                one[0] = one[0] + wave.signal(dragged * sensitivity)
+        known = np.array([servo.loop.velocity_ff, servo.loop.inertia_ff / self.mass])
+        base = np.concatenate([(one[0] - self._wanted) * self._weight for one in signals])
+        columns = np.column_stack(
+            [np.concatenate([one[k] * self._weight for one in signals]) for k in (1, 2)]
+        )
+        best = _least_squares(columns, base, known, np.array(self.free), self._most_fed(servo))
+        errors = tuple(
+            one[0] - self._wanted + best[0] * one[1] + best[1] * one[2] for one in signals
+        )
+        phasors = parts[0] + best[0] * parts[1] + best[1] * parts[2]
+        return (float(best[0]), float(best[1]) * self.mass), (errors[0], errors[1]), phasors
+
+    def _most_fed(self, servo: Servo) -> FloatArray:
+        """Return the largest shares of velocity and inertia: targets are rounded to encoder steps."""
+        alone = replace(servo.loop, velocity_ff=0.0, inertia_ff=self.mass)
+        noise = replace(servo, loop=alone).target_noise(self.bounds.resolution)
+        if not (isfinite(noise) and isfinite(self.bounds.noise) and noise > 0):
+            return MOST_FED
+        return np.asarray(np.minimum(MOST_FED, [1.0, FED_NOISE * self.bounds.noise / noise]))
+
+    @property
+    def _plants(self) -> tuple[ComplexArray, ComplexArray]:
+        return self._motor, self._load
+
+    def figures(self, servo: Servo) -> tuple[float, float]:
+        """Return a smooth measure of the time outside of the band, s, and the move's largest torque."""
+        gain, torque, pi = self._slow.gain(servo)
+        wave, sensitivity = self._wave, 1 / (1 + gain * self._motor)
+        _, errors, phasors = self._feed_forward(servo, sensitivity, torque, pi)
+        band = INNER_BAND * self.move.settling_band
+        disturbed = self._step * sensitivity
+        total = 0.0
+        for plant, error in zip(self._plants, errors, strict=True):
+            pushed = wave.signal(plant * disturbed)
+            total += MOVED * _outside(error[self._begin :], band)
+            energy = float(pushed @ pushed) * self._tick / band**2
+            total += STIFFNESS * self.move.duration / self._tick * float(np.log(energy + 1e-12))
+        follow = gain * sensitivity
+        for there, back, wanted, begin, other_band in self._others:
+            moved = wave.signal(there - back * follow)[begin:]
+            total += _outside(moved - wanted, other_band)
+        return 0.5 * self._tick * total, float(np.abs(wave.signal(phasors)).max())
+
+
+def _least_squares(
+    columns: FloatArray,
+    base: FloatArray,
+    known: FloatArray,
+    free: NDArray[np.bool_],
+    most: FloatArray,
+) -> FloatArray:
+    """Return shares within their bounds that make base + columns shares smallest; fixed ones stay."""
+    best = np.where(free, np.clip(known, 0.0, most), known)
+    for k in (0, 1, 0, 1) if free.all() else (0, 1):
+        if free[k]:
+            column = columns[:, k]
+            rest = base + columns @ best - column * best[k]
+            size = float(column @ column)
+            best[k] = float(np.clip(-(column @ rest) / max(size, 1e-300), 0.0, most[k]))
+    if free.all():
+        normal = columns.T @ columns
+        normal += 1e-12 * np.trace(normal) * np.eye(2)
+        pair = np.linalg.solve(normal, -(columns.T @ base))
+        if np.all((pair >= 0) & (pair <= most)):
+            return np.asarray(pair)
+    return best
+
+
+def _outside(error: FloatArray, band: float) -> float:
+    """Return a smooth count of the samples outside of a band."""
+    fourth = error / band
+    fourth *= fourth
+    fourth *= fourth
+    return float((fourth / (fourth + 1)).sum())

@@ -1,0 +1,179 @@
+"""A move and a step in time: from the response in frequency, and dry friction where there is any."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fieldtool.design.dragged import dragged
+from fieldtool.design.figures import MoveFigures, StepFigures, move_figures, step_figures
+from fieldtool.design.loops import Loops
+from fieldtool.design.machine import Machine, respond
+from fieldtool.design.moves import TestMove
+from fieldtool.design.servo import Servo
+from fieldtool.design.waves import HalfWave
+from fieldtool.records.model import FloatArray
+
+ComplexArray = NDArray[np.complexfloating[Any, Any]]
+DECAYS = 6.0
+"""Time constants after which a response has come to rest."""
+MOST_SAMPLES = 2**14
+LONGEST = 60.0
+"""s: no response is looked at for longer."""
+LONGEST_STUCK = 6.0
+"""s: nobody waits longer for an integrator to overcome friction."""
+
+
+@dataclass(frozen=True, eq=False)
+class Curves:
+    """Histories of one axis, for pictures and comparison."""
+
+    time: FloatArray
+    """s."""
+    reference: FloatArray
+    """Of the move, rad or m, from 0."""
+    position: FloatArray
+    """Motor."""
+    load: FloatArray
+    """Last mass."""
+    torque: FloatArray
+    """N m or N."""
+    step_time: FloatArray
+    step: FloatArray
+    """Motor after a unit step of the reference, without feed-forward."""
+
+
+@dataclass(frozen=True, eq=False)
+class Moved:
+    """What an axis does on its move and after a step."""
+
+    motor: MoveFigures
+    load: MoveFigures
+    step: StepFigures
+    """Without dry friction."""
+    peak_torque: float
+    curves: Curves
+
+
+def moved(
+    machine: Machine,
+    servos: tuple[Servo, ...],
+    axis: int,
+    move: TestMove,
+    eigenvalues: ComplexArray,
+) -> Moved:
+    """Return what an axis does on its move; the references of the others stand still.
+
+    With dry friction it moves out and back, and figures are the worse ones of both: before it goes back
+    the integrator holds what friction left of the move out.
+
+    Parameters
+    ----------
+    machine, servos
+        Loops closed; stable.
+    axis
+        Index.
+    move
+        Of the axis.
+    eigenvalues
+        Of the closed loops, rad/s.
+    """
+    beyond = move.duration
+    if machine.dry:
+        beyond += min(_stuck(machine, servos, move), LONGEST_STUCK)
+    wave = _wave(eigenvalues, beyond, move.duration / 200)
+    drive = wave.spectrum(wave.move(move))
+    loops = Loops(respond(machine, wave.omega), servos)
+    s = 1j * wave.omega
+    pushed = servos[axis].reference_gain(s) * drive
+    motor, load, torque = (wave.signal(one) for one in loops.motion(axis, pushed))
+    step = wave.spectrum(wave.step(1.0))
+    stepped = wave.signal(loops.motion(axis, servos[axis].step_gain(s) * step)[0]) + 0.5
+    half, time = 0.5 * move.distance, wave.time
+    reference = move.at(time)[0]
+    ways = [(motor + half, load + half, torque)]
+    if machine.dry:
+        ways = _dragged_ways(machine, servos, axis, wave, (loops, pushed), ways[0])
+    curves = Curves(time, reference, ways[0][0], ways[0][1], ways[0][2], time, stepped)
+    band = move.settling_band
+    return Moved(
+        _worst([move_figures(time, reference, way[0], band) for way in ways]),
+        _worst([move_figures(time, reference, way[1], band) for way in ways]),
+        step_figures(time, stepped, 1.0),
+        max(float(np.abs(way[2]).max()) for way in ways),
+        curves,
+    )
+
+
+def _dragged_ways(
+    machine: Machine,
+    servos: tuple[Servo, ...],
+    axis: int,
+    wave: HalfWave,
+    linear: tuple[Loops, ComplexArray],
+    way: tuple[FloatArray, FloatArray, FloatArray],
+) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
+    """Return motor, last mass and torque of the way out and of that back, friction included.
+
+    The way back is told as if it were a way out.
+    """
+    loops, pushed = linear
+    motors, torques = loops.moved(axis, pushed)
+    loads = np.einsum("fjk,fk->fj", loops.response.loads, torques)
+    s = 1j * wave.omega
+    speeds = []
+    for dry in machine.dry:
+        if dry.place in machine.motors:
+            one = motors[:, int(np.flatnonzero(machine.motors == dry.place)[0])]
+        else:
+            one = loads[:, int(np.flatnonzero(machine.loads == dry.place)[0])]
+        speeds.append(wave.signal(s * one))
+    out = np.column_stack(speeds)
+    step = wave.duration / wave.samples
+    added = dragged(machine, servos, axis, step, np.concatenate([out, -out]))
+    n = wave.samples
+    motor, load, torque = way
+    first = (motor + added.motor[:n], load + added.load[:n], torque + added.torque[:n])
+    back = (motor - added.motor[n:], load - added.load[n:], torque - added.torque[n:])
+    return [first, back]
+
+
+def _stuck(machine: Machine, servos: tuple[Servo, ...], move: TestMove) -> float:
+    """Return the time that an integrator takes to turn friction round from the edge of the band, s."""
+    longest = 0.0
+    for dry in machine.dry:
+        for motor, load, servo in zip(machine.motors, machine.loads, servos, strict=True):
+            if dry.place in (motor, load):
+                rate = servo.loop.velocity_i * servo.loop.position_p * move.settling_band
+                turned = dry.forward + dry.backward + 2 * dry.extra
+                longest = max(longest, turned / rate if rate > 0 else LONGEST_STUCK)
+    return longest
+
+
+def _worst(figures: Sequence[MoveFigures]) -> MoveFigures:
+    """Return the largest of each figure."""
+    return MoveFigures(
+        **{one.name: max(getattr(f, one.name) for f in figures) for one in fields(MoveFigures)}
+    )
+
+
+def _wave(values: ComplexArray, beyond: float, shortest: float) -> HalfWave:
+    """Return samples for a response of a machine with these eigenvalues.
+
+    Parameters
+    ----------
+    values
+        Eigenvalues, rad/s.
+    beyond
+        s, of the reference and of what else is to be seen.
+    shortest
+        s: no sample is longer.
+    """
+    duration = beyond + min(DECAYS / max(-float(values.real.max()), 1e-6), LONGEST)
+    matters = np.abs(values)[-values.real < 1e3 / duration + 20 / beyond]
+    fastest = float(matters.max()) if matters.size else 1 / shortest
+    step = min(shortest, 0.5 / fastest)
+    samples = 2 ** int(np.ceil(np.log2(min(max(duration / step, 256), MOST_SAMPLES))))
+    return HalfWave(duration, samples)
