@@ -52,6 +52,10 @@ def parse_quantity(text: object, *dimensions: str) -> float:
     """
     known = {unit: factor for d in dimensions for unit, factor in UNITS[d].items()}
     wanted = f"a number with one of the units {', '.join(known)}"
+    if isinstance(text, int | float) and not isinstance(text, bool):
+        first, *others = known
+        more = f" (or {', '.join(others)})" if others else ""
+        raise ValueError(f"{text} has no unit: write it with one, as {text} {first}{more}")  # noqa: TRY004
     if not isinstance(text, str):
         raise ValueError(f"needs {wanted}, got {text!r}")  # noqa: TRY004
     match = _QUANTITY.fullmatch(text)
@@ -59,7 +63,7 @@ def parse_quantity(text: object, *dimensions: str) -> float:
         raise ValueError(f"needs {wanted}, got {text!r}")
     number, unit = match.groups()
     unit = unit.replace("·", " ").replace("*", " ").replace("N.m", "N m").replace("²", "2")
-    unit = {"Nm": "N m", "mNm": "mN m", "kNm": "kN m", "kgm2": "kg m2"}.get(unit, unit)
+    unit = {"°": "deg", "Nm": "N m", "mNm": "mN m", "kNm": "kN m", "kgm2": "kg m2"}.get(unit, unit)
     if unit not in known and unit.startswith(","):
         point = f"{number}.{unit[1:]}"
         raise ValueError(f"write the number with a point: {point}, not {text}")

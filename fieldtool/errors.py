@@ -6,6 +6,7 @@
     ├── FileFormatError          a file is not what it should be (file, line, column, what to do)
     ├── OutputError              a folder or file can not be written
     ├── NoSuchAxisError          an axis was named that the recording does not have
+    ├── NoSuchToolError          a tool set was named that the machine does not have
     ├── UnfinishedWriteError     a write-back was cut off and has to be taken back first
     ├── PlanRefusedError         the experiment would leave a limit, or nothing safe is possible
     └── IdentificationError      the data do not allow the answer
@@ -50,6 +51,10 @@ class OutputError(FieldtoolError):
 
 class NoSuchAxisError(FieldtoolError):
     """An axis was named that is not there; the message lists those that are."""
+
+
+class NoSuchToolError(FieldtoolError):
+    """A tool set was named that is not there; the message lists those that are."""
 
 
 class UnfinishedWriteError(FieldtoolError):

@@ -44,7 +44,36 @@ def load_drive(name_or_path: str | Path, beside: Path | None = None) -> DrivePro
     """
     if beside is not None and (beside.parent / name_or_path).is_file():
         name_or_path = beside.parent / name_or_path
-    return _load(_find("drives", name_or_path), DriveProfile)
+    try:
+        path = _find("drives", name_or_path)
+    except _NoProfileError as error:
+        raise _named_in(beside, str(name_or_path), error) from None
+    return _load(path, DriveProfile)
+
+
+class _NoProfileError(ProfileError):
+    """There is none of that name."""
+
+    def __init__(self, path: Path, kind: str, known: str) -> None:
+        self.message = (
+            f"no such {kind} profile; packaged are: {known}. Give one of these names or the path of a "
+            "YAML file."
+        )
+        super().__init__(path, self.message)
+
+
+def _named_in(file: Path | None, name: str, error: _NoProfileError) -> ProfileError:
+    """Return what says where a machine profile names a drive profile that there is none of."""
+    if file is None or not file.is_file():
+        return error
+    data, lines = read_yaml(file)
+    axes = data.get("axes") if isinstance(data, Mapping) else None
+    for k, axis in enumerate(axes if isinstance(axes, list) else ()):
+        if isinstance(axis, Mapping) and axis.get("drive") == name:
+            place = ("axes", k, "drive")
+            message = f"{place_words(place, data)}, {name!r}: {error.message}"
+            return ProfileError(file, message, line_of(lines, place))
+    return error
 
 
 def packaged(kind: Literal["drives", "machines"]) -> tuple[str, ...]:
@@ -66,11 +95,7 @@ def _find(kind: Literal["drives", "machines"], name_or_path: str | Path) -> Path
         with as_file(packaged_file) as found:
             if found.is_file():
                 return found
-    raise ProfileError(
-        path,
-        f"no such {kind[:-1]} profile; packaged are: {', '.join(packaged(kind))}. "
-        "Give one of these names or the path of a YAML file.",
-    )
+    raise _NoProfileError(path, kind[:-1], ", ".join(packaged(kind)))
 
 
 LONGEST_NUMBER = 1000

@@ -18,6 +18,7 @@ from drives.profile.values import (
     Number,
     Part,
     Positive,
+    Seconds,
 )
 from drives.units import Kind, parse_quantity
 
@@ -77,6 +78,21 @@ class MoveProfile(Part):
     the distance."""
 
 
+def _travel_of(given: object, quantity: str) -> tuple[float, ...]:
+    """Read the lowest and the highest position, SI."""
+    if isinstance(given, list) and len(given) == 2:
+        return tuple(parse_quantity(value, quantity) for value in given)
+    wanted = "needs the lowest and the highest position in brackets, such as [-90 deg, 90 deg]"
+    if quantity == "length":
+        wanted = "needs the lowest and the highest position in brackets, such as [-0.2 m, 0.2 m]"
+    if isinstance(given, list) and len(given) > 2:
+        raise ValueError(
+            f"{wanted}; {len(given)} values stand here. A comma ends a value: write numbers with a "
+            "point, 1.5 and not 1,5"
+        )
+    raise ValueError(f"{wanted}, got {given!r}")
+
+
 class AxisProfile(Part):
     """One axis of a machine."""
 
@@ -132,8 +148,8 @@ class AxisProfile(Part):
             value = limits[key]
             try:
                 limits[key] = (
-                    tuple(parse_quantity(v, quantity) for v in value)
-                    if isinstance(value, list)
+                    _travel_of(value, quantity)
+                    if key == "travel"
                     else parse_quantity(value, quantity)
                 )
             except ValueError as error:
@@ -168,6 +184,9 @@ class MachineProfile(Part):
     description: str = ""
     bus: BusProfile
     axes: Annotated[tuple[AxisProfile, ...], Field(min_length=1, max_length=32)]
+    controller_cycle: Annotated[Seconds, Field(ge=1e-5, le=0.1)] | None = None
+    """s, from one cyclic target to the next of the machine's own controller, which moves it after the
+    commissioning: parameters are designed for it; None: for the cycle of this tool."""
     couplings: tuple[CouplingProfile, ...] = ()
     """Of the prior model."""
     simulation: SimulationProfile | None = None

@@ -116,7 +116,10 @@ def problem_words(error: Mapping[str, Any]) -> str:
         return f"has to be {str(limits.get('expected')).replace(chr(39), '')}{shown}"
     for name, words in (("gt", "above"), ("ge", "at least"), ("lt", "below"), ("le", "at most")):
         if name in limits:
-            return f"has to be {words} {limits[name]}{shown}"
+            comma = ""
+            if given == 0 and isinstance(error["loc"][-1], int):
+                comma = ". A comma ends a value: write numbers with a point, 0.02 and not 0,02"
+            return f"has to be {words} {limits[name]}{shown}{comma}"
     message = str(error["msg"]).removeprefix("Value error, ")
     value = f" (value {_shown(given)})" if isinstance(given, str | int | float | bool) else ""
     return f"{message[0].lower()}{message[1:]}{value}"

@@ -35,6 +35,7 @@ NOT_IMITATED: tuple[str, ...] = (
     "jitter of SYNC and of the host, and late or doubled SYNCs that the host did not send",
     "the nodes' time to answer: all but storing parameters is answered at once",
     "boot-up times, and the operating temperature and ageing of drives",
+    "what drives hold from one command to the next: they begin anew with each",
 )
 """What the lock-step bus leaves out; what reports on simulated results repeats."""
 

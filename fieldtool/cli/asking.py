@@ -1,10 +1,11 @@
 """Asks a person before drives are written."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import typer
 from rich.console import Console
 
+from drives.errors import UserStopError
 from drives.parameters import Change
 from fieldtool.cli.output import told
 from fieldtool.cli.screen import parameter_table_of
@@ -13,26 +14,46 @@ from fieldtool.errors import PlanRefusedError
 from fieldtool.writeback.transaction import WriteBack
 
 
-def may_write(
-    console: Console, key: StopKey, *, yes: bool, store: bool
-) -> Callable[[Sequence[Change]], bool]:
-    """Return what shows old and new values and asks whether to write them.
+class WriteQuestion:
+    """Shows old and new values, and asks whether to write them.
 
-    Without ``--yes`` and with nobody to ask it raises PlanRefusedError.
+    Raises
+    ------
+    PlanRefusedError
+        Without ``--yes``, where there is nobody to ask.
     """
 
-    def ask(changes: Sequence[Change]) -> bool:
-        key.check()
-        if yes:
+    def __init__(self, console: Console, key: StopKey, *, yes: bool, store: bool) -> None:
+        self._console, self._key, self._yes, self._store = console, key, yes, store
+        self.refused = False
+        """Whether the answer was no."""
+
+    def __call__(self, changes: Sequence[Change]) -> bool:
+        """Return whether to write."""
+        self._key.check()
+        if self._yes:
             return True
         planned = WriteBack((), tuple(changes), in_memory=False, stored=False, backup=None)
-        console.print(parameter_table_of(planned, console.width))
+        self._console.print(parameter_table_of(planned, self._console.width))
         if not somebody_there():
             raise PlanRefusedError(
                 "there is nobody to ask before the drives are written. Use --yes to write without "
                 "asking. Nothing was written."
             )
-        where = "working memory, and store them" if store else "working memory (not stored)"
-        return typer.confirm(told(f"Write these parameters into the drives' {where}?"), err=True)
+        where = "working memory, and store them" if self._store else "working memory (not stored)"
+        question = told(f"Write these parameters into the drives' {where}?")
+        self.refused = not typer.confirm(question, err=True)
+        return not self.refused
 
-    return ask
+    def end(self) -> None:
+        """End a command that was refused here, after it has shown what it found.
+
+        Raises
+        ------
+        UserStopError
+            If the answer was no.
+        """
+        if self.refused:
+            raise UserStopError(
+                "not written, as you answered; the drives hold their old parameters."
+            )

@@ -10,21 +10,15 @@ from rich.console import Console
 from rich.text import Text
 
 from fieldtool import workflow
+from fieldtool.cli.options import ResponseChoice, check_response
 from fieldtool.cli.output import Json, console_of, indented, print_json
 from fieldtool.cli.progress import ShareBar
 from fieldtool.cli.sheet import Sheet
 from fieldtool.design.predict import AxisPrediction
-from fieldtool.design.tuning import BOUND, MOST_BOUND, RESPONSES, Tuning
+from fieldtool.design.tuning import BOUND, MOST_BOUND, Tuning
 from fieldtool.design.tuning_file import tuning_as_dict
 
 Figure = Callable[[AxisPrediction], float | None]
-ResponseChoice = Annotated[
-    str,
-    typer.Option(
-        "--response",
-        help=f"How near to the bound the new parameters go: {', '.join(RESPONSES)}.",
-    ),
-]
 
 
 def _motor(name: str) -> Figure:
@@ -82,12 +76,6 @@ def design(
     console.print(Text(f"Kept in {folder}; `fieldtool write {folder}` brings it into the drives."))
     if as_json:
         print_json(tuning_as_dict(tuning))
-
-
-def check_response(response: str) -> None:
-    """Refuse a response that there is none of."""
-    if response not in RESPONSES:
-        raise typer.BadParameter(f"--response is one of {', '.join(RESPONSES)}, got {response!r}")
 
 
 def show_tuning(console: Console, tuning: Tuning) -> None:

@@ -5,12 +5,16 @@ import shutil
 import sys
 import textwrap
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 from rich.console import Console
 from rich.padding import Padding
 from rich.text import Text
+
+from fieldtool import workflow
+from fieldtool.writeback.transaction import WriteBack
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")]
 """Option of every command that can answer a program."""
@@ -39,6 +43,16 @@ def told(text: str) -> str:
         for line in text.split("\n")
     )
     return "\n".join("\n".join(line) for line in lines)
+
+
+def written_as_dict(folder: Path, result: WriteBack) -> dict[str, Any]:
+    """Return what ``--json`` prints of a write."""
+    return {
+        "folder": str(folder),
+        "written": result.in_memory,
+        "stored": result.stored,
+        "parameters": workflow.parameter_table(result),
+    }
 
 
 def print_json(data: Mapping[str, Any]) -> None:

@@ -307,24 +307,29 @@ def _plain(value: object) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
-def show_result(console: Console, result: SessionResult) -> None:
-    """Show the parameters, and where everything is."""
+def show_result(console: Console, result: SessionResult, *, listed: bool = False) -> None:
+    """Show the parameters, unless they were listed just now, and where everything is."""
     if result.write_back is not None:
-        console.print("\n[bold]Controller parameters[/bold]")
-        show_parameters(console, result.write_back)
+        if not listed:
+            console.print("\n[bold]Controller parameters[/bold]")
+        show_parameters(console, result.write_back, listed=listed)
+        if not result.write_back.in_memory:
+            command = f"`fieldtool write {result.folder}`"
+            console.print(indented(f"{command} brings the new ones into the drives."))
     console.print(
         Text(
-            f"\nMachine time {clock(result.machine_time)}, wall time {clock(result.wall_time)}. "
-            f"Everything is in {result.folder}; report.html there, opened in a browser, shows "
-            "what was found."
+            f"\nMachine time {clock(result.moving_time)}, {clock(result.machine_time)} of it "
+            f"excitation; wall time {clock(result.wall_time)}. Everything is in {result.folder}; "
+            "report.html there, opened in a browser, shows what was found."
         )
     )
 
 
-def show_parameters(console: Console, write_back: WriteBack) -> None:
+def show_parameters(console: Console, write_back: WriteBack, *, listed: bool = False) -> None:
     """Show old and new parameters, what was read back, and where the new ones are."""
-    console.print(parameter_table_of(write_back, console.width))
-    console.print(indented(f"{write_back.sentence}"))
+    if not listed:
+        console.print(parameter_table_of(write_back, console.width))
+    console.print(indented(write_back.sentence))
 
 
 def parameter_table_of(write_back: WriteBack, width: int) -> Sheet:

@@ -9,9 +9,9 @@ import typer
 from rich.text import Text
 
 from fieldtool import workflow
-from fieldtool.cli.asking import may_write
+from fieldtool.cli.asking import WriteQuestion
 from fieldtool.cli.bus_options import Bitrate, Channel, Interface, on_bus
-from fieldtool.cli.output import Json, console_of, indented, print_json
+from fieldtool.cli.output import Json, console_of, indented, print_json, written_as_dict
 from fieldtool.cli.screen import TerminalScreen, show_parameters
 from fieldtool.cli.sheet import Sheet
 from fieldtool.cli.stop_key import stop_key
@@ -122,28 +122,23 @@ def switch(
     folder = out or Path("sessions") / f"{Path(machine).stem}-{name}-{datetime.now():%Y%m%d-%H%M%S}"
     taking_back = "Stopping; what was written is taken back ..."
     with stop_key(taking_back) as key, TerminalScreen(console) as screen:
+        ask = WriteQuestion(console, key, yes=yes, store=store)
         result = workflow.switch_tool(
             on_bus(machine, interface, channel, bitrate),
             name,
             folder,
-            may_write(console, key, yes=yes, store=store),
+            ask,
             store=store,
             same_drives=same_drives,
             screen=screen,
             stop_requested=key,
         )
-    show_parameters(console, result)
+    show_parameters(console, result, listed=ask.refused)
     if result.in_memory:
         console.print(indented(f"`fieldtool restore {folder}` takes it back."))
     if as_json:
-        print_json(
-            {
-                "folder": str(folder),
-                "written": result.in_memory,
-                "stored": result.stored,
-                "parameters": workflow.parameter_table(result),
-            }
-        )
+        print_json(written_as_dict(folder, result))
+    ask.end()
 
 
 def _tools_table(tools: Sequence[ToolSet]) -> Sheet:

@@ -137,6 +137,16 @@ def save(recording: Recording, path: Path | str) -> None:
     RecordingWriter(path, recording).close()
 
 
+def recorded_seconds(path: Path) -> float:
+    """Return the seconds that a recording holds, all experiments together; 0 if it can not be read."""
+    try:
+        with h5py.File(path, "r") as file:
+            rows = sum(len(one["time"]) for one in file["experiments"].values())
+            return float(rows * file.attrs["sample_period"])
+    except (*DAMAGED, ValueError):
+        return 0.0
+
+
 def load(path: Path | str) -> Recording:
     """Return the recording in the file ``path``.
 

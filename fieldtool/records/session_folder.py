@@ -173,6 +173,11 @@ class SessionFolder:
         return self.path / "verification.yaml"
 
     @property
+    def trials(self) -> tuple[Path, ...]:
+        """Raw data of the trials of parameters, of each write that was tried."""
+        return tuple(sorted(self.path.glob("verification*.h5")))
+
+    @property
     def verification_picture(self) -> Path:
         """Moves and sensitivities before, predicted and after."""
         return self.path / "verification.png"

@@ -29,6 +29,8 @@ class Material:
     truth: MachineModel | None = None
     """What a simulated machine really is."""
     recording: Recording | None = None
+    trial_seconds: float = 0.0
+    """Seconds in which new parameters were tried, old ones beside them; not in the recording."""
     responses: Mapping[str, FrequencyResponse] = field(default_factory=dict)
     band: ModelBand | None = None
     """How well the identified model's response is known."""

@@ -40,6 +40,10 @@ def facts(material: Material) -> tuple[tuple[str, str], ...]:
         )
     if material.recording is not None:
         out.append(("Measured", _measured(material.recording)))
+    if material.trial_seconds:
+        out.append(
+            ("Tried", f"old and new parameters, {material.trial_seconds:.3g} s of machine time")
+        )
     return tuple(out)
 
 

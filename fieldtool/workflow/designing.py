@@ -71,7 +71,7 @@ def designed(
     """Design for a machine, and write ``tuning.yaml``."""
     tuning = design(
         model,
-        drive_sides(folder, machine),
+        drive_sides(folder, machine, machine.controller_cycle),
         moves_of(machine, model),
         response=response,
         bound=bound,

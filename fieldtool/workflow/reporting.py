@@ -19,7 +19,7 @@ from fieldtool.frf.response import load_band, load_responses
 from fieldtool.records.files import read_text
 from fieldtool.records.model import MachineModel
 from fieldtool.records.model_file import read_model
-from fieldtool.records.recording import Recording, load
+from fieldtool.records.recording import Recording, load, recorded_seconds
 from fieldtool.records.session_folder import SessionFolder
 from fieldtool.records.yaml_file import MAX_BYTES
 from fieldtool.report.contents import page_of
@@ -122,6 +122,7 @@ def material_of(folder: SessionFolder) -> Material:
         prior=_prior(machine),
         truth=truth_model(machine) if machine else None,
         recording=recording,
+        trial_seconds=sum(map(recorded_seconds, folder.trials)),
         responses=responses or {},
         band=read(folder.frequency_response, load_band, "") if responses else None,
         model=model,

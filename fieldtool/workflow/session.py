@@ -144,6 +144,8 @@ class SessionResult:
     """What the simulation gets wrong; None where the data did not allow a criticism."""
     verification: Verified | None = None
     """What the trial of the new parameters showed; None where nothing was written or tried."""
+    moving_time: float = 0.0
+    """Seconds that were recorded in all: direction check, excitation, trials of parameters."""
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values, as ``--json`` prints them."""
@@ -151,7 +153,11 @@ class SessionResult:
             "model": self.model.as_dict(),
             "criticism": self.criticism.as_dict() if self.criticism else None,
             "truth": self.truth.as_dict() if self.truth else None,
-            "time": {"machine_s": self.machine_time, "wall_s": self.wall_time},
+            "time": {
+                "machine_s": self.machine_time,
+                "moving_s": self.moving_time,
+                "wall_s": self.wall_time,
+            },
             "parameters": parameter_table(self.write_back),
             "verification": self.verification.as_dict() if self.verification else None,
             "warnings": list(self.warnings),
@@ -256,6 +262,10 @@ def open_session(
                     session.warn(text)
     except BaseException as error:
         folder.note("ended", error=type(error).__name__, text=str(error))
+        if not keep_profile and folder.recording.is_file():
+            error.add_note(
+                f"What was measured is kept in {folder.path}: `fieldtool report {folder.path}` shows it."
+            )
         raise
     folder.note("ended")
 

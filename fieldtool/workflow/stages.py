@@ -23,9 +23,7 @@ from fieldtool.identify.likelihood.model_band import relative_std
 from fieldtool.identify.recorded import Identified, identify_recording
 from fieldtool.records.model import Estimate, MachineModel
 from fieldtool.records.model_file import read_model, write_model
-from fieldtool.records.recording import (
-    load,
-)
+from fieldtool.records.recording import load, recorded_seconds
 from fieldtool.records.session_folder import SessionFolder
 from fieldtool.report.pictures import draw_responses
 from fieldtool.workflow.criticising import criticised
@@ -58,6 +56,10 @@ BAND_POINTS = 400
 """Frequencies at which the band of the model's response is kept."""
 DATA_SHEET_APART = 4.0
 """Tolerances of a motor's inertia that the identified first mass may be apart without a word."""
+BEGIN_ANEW = (
+    "Its drives begin anew with every command, holding the gains of the profile: what an earlier one "
+    "wrote into them is gone."
+)
 Confirm = Callable[[Sequence[Change]], bool]
 
 
@@ -142,6 +144,7 @@ def run(
         tuple(session.warnings),
         criticism,
         verification,
+        sum(map(recorded_seconds, (session.folder.recording, *session.folder.trials))),
     )
 
 
@@ -303,7 +306,7 @@ def restore(
     screen.stage(f"Connect to {profile.name}")
     simulated = simulated_words(profile)
     if simulated:
-        screen.say(simulated)
+        screen.say(f"{simulated} {BEGIN_ANEW}")
     with connect(profile, trace=trace, to_move=False) as group:
         screen.stage("Bring the old parameters back")
         return bring_back(

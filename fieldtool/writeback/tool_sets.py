@@ -30,7 +30,7 @@ from drives.parameters import (
     save_backup,
 )
 from drives.parameters.journal import State
-from fieldtool.errors import OutputError
+from fieldtool.errors import NoSuchToolError, OutputError
 from fieldtool.records.session_folder import SessionFolder
 from fieldtool.writeback.tool_file import (
     ToolFile,
@@ -112,8 +112,10 @@ def tool_set(machine: str, name: str) -> ToolSet:
 
     Raises
     ------
+    NoSuchToolError
+        If there is none of that name.
     ProfileError
-        If there is none of that name, or it is not whole.
+        If it is not whole.
     """
     _check_name(name)
     folder = tools_folder(machine) / name
@@ -121,8 +123,9 @@ def tool_set(machine: str, name: str) -> ToolSet:
     if not path.is_file():
         others = [one.name for one in tools_folder(machine).glob("*") if one.is_dir()]
         known = f"there are {', '.join(sorted(others))}" if others else "there is none yet"
-        raise ProfileError(
-            path, f"machine {machine} has no tool set {name!r}; {known} (`fieldtool tools keep`)"
+        raise NoSuchToolError(
+            f"machine {machine} has no tool set {name!r}; {known}. `fieldtool tools keep {machine} "
+            f"{name}` keeps one."
         )
     data = read_tool_file(path, name, machine)
     parameters = load_backup(folder / "parameters.yaml")

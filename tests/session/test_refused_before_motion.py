@@ -79,7 +79,7 @@ WRONG_PROFILES = {
     "no limits": (take("axes", 0, "limits"), "without this limit nothing may move", "name: table"),
     "no travel": (take(*LIMITS, "travel"), "axis table, limits.travel is missing", "limits:"),
     "no torque": (take(*LIMITS, "torque"), "axis table, limits.torque is missing", "limits:"),
-    "bare number": (put(*LIMITS, "torque", value=6), "needs a number with one", "torque: 6"),
+    "bare number": (put(*LIMITS, "torque", value=6), "6 has no unit: write it with one", "torque: 6"),
     "wrong unit": (put(*LIMITS, "velocity", value="10 rad"), "unit 'rad' does not fit", "velocity:"),
     "linear unit": (put(*LIMITS, "torque", value="6 N"), "unit 'N' does not fit", "torque: 6 N"),
     "negative": (put(*LIMITS, "velocity", value="-1 rad/s"), "above 0", "velocity: -1"),

@@ -312,3 +312,25 @@ def test_a_stop_while_a_set_is_written_takes_it_back(session, tmp_path, monkeypa
     assert "what was written is taken back" in outcome.err
     assert "All drives hold the old values" in outcome.err
     assert session.changed() == written
+
+
+@pytest.mark.usefixtures("untried")
+@pytest.mark.parametrize("command", ["write", "switch"])
+def test_who_answers_no_gets_130_and_the_drives_as_they_were(
+    session, command, monkeypatch, tmp_path
+):
+    tools(session, "keep", "bare")
+    session.command("write", session.out, "--yes")
+    assert tools(session, "keep", "gripper", "--from", session.out).code == 0
+    session.command("restore", session.out)
+    monkeypatch.setattr("fieldtool.cli.asking.somebody_there", lambda: True)
+    asked = []
+    monkeypatch.setattr("typer.confirm", lambda text, **_: asked.append(text))
+    if command == "write":
+        outcome = session.command("write", session.out, "--no-verify")
+    else:
+        outcome = tools(session, "switch", "gripper", "--out", tmp_path / "one")
+    assert outcome.code == 130
+    assert "not written, as you answered" in outcome.err
+    assert len(asked) == 1
+    assert session.changed() == {}

@@ -1,5 +1,6 @@
 """What a design is told of drives: from a backup as from the drive itself; what is said where not."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -7,9 +8,12 @@ import pytest
 import yaml
 
 from drives.canopen_drive import connect
+from drives.errors import ProfileError
 from drives.parameters import back_up, planned_changes, read_loop, save_backup
 from drives.profile import load_machine
 from fieldtool.cli.main import main
+from fieldtool.design.drive_side import DriveSide
+from fieldtool.design.rule import DesignError
 from fieldtool.records.model_file import write_model
 from fieldtool.records.recording import save
 from fieldtool.records.session_folder import SessionFolder
@@ -159,3 +163,26 @@ def test_a_pid_that_no_cascade_is_can_not_be_compared(tmp_path: Path) -> None:
     side = drive_sides(folder, machine)[1]
     assert side.present is None
     assert "none that position P and velocity PI could be" in side.unreadable
+
+
+def test_parameters_are_designed_for_the_controllers_own_cycle_where_the_profile_has_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = session(tmp_path, ("reference", "reference"))
+    seen = []
+
+    def noted(_model: object, sides: Sequence[DriveSide], *_: object, **__: object) -> None:
+        seen.append([side.timing.cycle for side in sides])
+        raise DesignError("seen enough")
+
+    monkeypatch.setattr("fieldtool.workflow.designing.design", noted)
+    for line in ("", "controller_cycle: 2 ms\n"):
+        folder.machine.write_text(folder.machine.read_text() + line)
+        with pytest.raises(DesignError):
+            redesign(folder.path)
+    assert seen == [[0.004, 0.004], [0.002, 0.002]]
+    for wrong, told in (("0 ms", "above"), ("2", "has no unit"), ("2 s", "at most 0.1")):
+        text = folder.machine.read_text().replace("2 ms", wrong)
+        (tmp_path / "wrong.yaml").write_text(text)
+        with pytest.raises(ProfileError, match=f"controller_cycle: .*{told}"):
+            load_machine(tmp_path / "wrong.yaml")

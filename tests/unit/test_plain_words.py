@@ -2,6 +2,7 @@
 
 import pytest
 
+from drives.canopen_drive.group import profile_of
 from drives.errors import ProfileError
 from drives.profile import load_machine
 from drives.profile.plain_words import place_words
@@ -35,7 +36,10 @@ PROGRAMMERS = (
         ("    kind: rotary", "\tkind: rotary", 6, "begins with a tab: indent with blanks"),
         ("node_id: 11", "node_id: eleven", 7, "axis table, node_id: a whole number belongs here"),
         ("kind: rotary", "kind: round", 6, "axis table, kind: has to be rotary or linear"),
-        ("travel: [-120 deg, ", "travel: [-120 deg, 0 deg, ", 10, "3 values stand here, at most 2"),
+        ("travel: [-120 deg, ", "travel: [-120 deg, 0 deg, ", 10, "3 values stand here. A comma ends"),
+        ("[-120 deg, 120 deg]", "120 deg", 10, "position in brackets, such as [-90 deg, 90 deg], got"),
+        ("[0.02, 0.025]", "[0,02, 0.025]", 16, "not 0. A comma ends a value: write numbers with a"),
+        ("drive: reference", "drive: referenz", 8, "axis table, drive, 'referenz': no such drive pro"),
         ("name: m\n", "name m\n", 3, "a key needs a colon"),
         ("[0.02, 0.025]", "[0.02, -1]", 16, "axis table, prior.masses, number 2: has to be above 0"),
         ("drive: reference", "drive: [1]", 8, "axis table, drive: text belongs here"),
@@ -46,7 +50,8 @@ def test_a_fault_is_said_in_plain_words_with_its_line(tmp_path, old, new, line, 
     path = tmp_path / "m.yaml"
     path.write_text(GOOD.replace(old, new), encoding="utf-8")
     with pytest.raises(ProfileError) as refused:
-        load_machine(path)
+        machine = load_machine(path)
+        profile_of(machine.axes[0], machine)
     text = str(refused.value)
     assert said in text
     assert text.startswith(f"{path}:{line}: ")

@@ -187,12 +187,23 @@ def test_a_result_on_the_screen(folder: str) -> None:
     identified: Any = SimpleNamespace(notes=())
     tuning = Tuning((AxisTuning("axis1", {"velocity_p": 4.2}, 1.5, "total inertia 5"),))
     result = SessionResult(
-        Path(folder), found, identified, tuning, write_back, found, 754.0, 61.5, ()
+        Path(folder),
+        found,
+        identified,
+        tuning,
+        write_back,
+        found,
+        754.0,
+        61.5,
+        (),
+        moving_time=800.0,
     )
     out = console(200)
     show_result(out, result)
     assert f"Everything is in {folder}" in text(out)
-    assert "Machine time 12 min 34 s, wall time 1 min 02 s" in text(out)
+    assert "Machine time 13 min 20 s, 12 min 34 s of it excitation; wall time 1 min 02 s." in text(
+        out
+    )
     assert write_back.sentence in text(out)
     with TerminalScreen(console(200)) as screen:
         screen.found(result.model, result.truth)

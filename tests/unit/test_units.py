@@ -62,7 +62,8 @@ def test_every_unit_was_tried_or_is_the_base_unit() -> None:
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        (90, "needs a number with one of the units rad, mrad, deg, rev, got 90"),
+        (90, r"90 has no unit: write it with one, as 90 rad \(or mrad, deg, rev\)"),
+        (True, "needs a number with one of the units rad, mrad, deg, rev, got True"),
         (None, "got None"),
         ("90", "got '90'"),
         ("deg", "got 'deg'"),
