@@ -17,6 +17,7 @@ from fieldtool.cli.sheet import Sheet
 from fieldtool.design.predict import AxisPrediction
 from fieldtool.design.tuning import BOUND, MOST_BOUND, Tuning
 from fieldtool.design.tuning_file import tuning_as_dict
+from fieldtool.report.words import AT_ONCE
 
 Figure = Callable[[AxisPrediction], float | None]
 
@@ -107,11 +108,16 @@ def _table(tuning: Tuning, axes: Sequence[AxisPrediction]) -> Sheet:
     table = Sheet("predicted (SI)", *titles, numbers=titles)
     for title, scale, of in ROWS:
         shown = [one for axis in axes for one in ((now.of(axis.axis), axis) if now else (axis,))]
-        table.add(title, *(_cell(of(one), scale) for one in shown))
+        table.add(
+            title,
+            *(_cell(of(one), scale, AT_ONCE if "settling" in title else "0") for one in shown),
+        )
     return table
 
 
-def _cell(value: float | None, scale: float) -> str:
+def _cell(value: float | None, scale: float, zero: str) -> str:
     if value is None or isnan(value):
         return "-"
+    if value == 0:
+        return zero
     return f"{scale * value:.3g}" if isfinite(value) else "does not"

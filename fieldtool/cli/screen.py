@@ -24,6 +24,7 @@ from fieldtool.experiment.stepped.runner import Progress
 from fieldtool.identify.likelihood.expected import Expected
 from fieldtool.records.model import MachineModel
 from fieldtool.report.numbers import UNITS, ModelNumber, model_numbers
+from fieldtool.report.words import AT_ONCE
 from fieldtool.workflow import SessionResult, parameter_table
 from fieldtool.workflow.planning import PlannedFast
 from fieldtool.workflow.verified import Verified
@@ -356,6 +357,8 @@ def verification_table(axes: Sequence[Comparison]) -> Sheet:
             cells = [
                 ""
                 if figures is None or (value := getattr(figures, name)) is None
+                else AT_ONCE
+                if name == "settling_time" and value == 0
                 else f"{value:.3g}"
                 for figures in (one.before, one.predicted, one.after)
             ]

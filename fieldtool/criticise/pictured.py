@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from fieldtool.criticise.effects.base import Context
 from fieldtool.criticise.evidence.lines import Lines, unflat
 from fieldtool.criticise.evidence.spans import Role
-from fieldtool.criticise.pictures_file import Kind, Picture, Series
+from fieldtool.criticise.pictures_file import NOISE_ONLY, Kind, Picture, Series
 from fieldtool.criticise.search.fit import Fitted
 from fieldtool.criticise.search.search import Found
 from fieldtool.criticise.simulate.motion import Motion
@@ -98,7 +98,7 @@ def _quiet(sides: Sides, axis: int) -> str:
     """Say that there is nothing but noise; empty where there is more."""
     before, noise = relative_error(sides[0].parts, axis), relative_noise(sides[0].parts, axis)
     if noise is not None and before < NOISY * noise:
-        return "what is not explained is noise"
+        return NOISE_ONLY
     return ""
 
 

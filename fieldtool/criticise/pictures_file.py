@@ -17,6 +17,8 @@ FORMAT = "fieldtool-views/1"
 Kind = Literal[
     "frequency", "lines", "amplitude", "velocity", "position", "time", "session", "axes", "follows"
 ]
+NOISE_ONLY = "what is not explained is noise"
+"""Sentence of a picture that shows nothing else."""
 
 
 @dataclass(frozen=True, eq=False)

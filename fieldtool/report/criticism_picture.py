@@ -49,7 +49,8 @@ def draw_criticism(criticism: Criticism, pictures: Sequence[Picture], path: Path
                 if picture.axis == axis and picture.kind == kind:
                     _draw(plot, picture)
         row[0].set_ylabel(f"{axis}: {row[0].get_ylabel()}")
-    grid[0][0].legend(fontsize=8, loc="upper right")
+    for plot in grid[0][:2]:
+        plot.legend(fontsize=8, loc="upper right")
     names = ", ".join(f"{c.effect} ({c.axis_words})" for c in criticism.causes)
     figure.suptitle(f"{criticism.verdict}: {names or 'no cause named'}", fontsize=11)
     try:
@@ -66,7 +67,9 @@ def _draw(plot: Axes, picture: Picture) -> None:
                 series.x, series.y, series.std, color=color, lw=1, marker=".", ms=3, elinewidth=0.6
             )
         elif picture.logarithmic:
-            plot.loglog(series.x, np.maximum(series.y, 1e-12), color=color, lw=0.6)
+            plot.loglog(
+                series.x, np.maximum(series.y, 1e-12), color=color, lw=0.6, label=series.label
+            )
         else:
             plot.plot(series.x, series.y, color=color, lw=0.7, label=series.label)
     if not picture.logarithmic:

@@ -27,7 +27,12 @@ COLORS = {
     "noise": NOISE,
 }
 POINTS = 400
-FEW_DECADES = 2.0
+FEW_DECADES = 2.5
+"""On a logarithmic axis, below which 2 and 5 are labelled between the powers of ten."""
+MOST_DECADES = 7
+"""Powers of ten that are labelled; of more, every second or third."""
+SMALLEST_PLAIN = 1e-3
+"""Smaller numbers are labelled as powers of ten, and larger ones than its inverse."""
 WIDEST = 5.0
 """Natural logarithm of the largest factor that a band shows."""
 FAINTEST = 1e-7
@@ -45,7 +50,7 @@ def numbers(values: FloatArray) -> list[float | None]:
 
 def layout(x: str, y: str, *, logarithmic: bool = False, legend: bool = True) -> Figure:
     """Return how a figure looks that has one pair of axes."""
-    kind = {"type": "log", "exponentformat": "power", "dtick": 1} if logarithmic else {}
+    kind = {"type": "log"} if logarithmic else {}
     frame = {
         "automargin": True,
         "zeroline": False,
@@ -134,16 +139,36 @@ def response_figure(
     look = layout("frequency, Hz", unit, logarithmic=True, legend=place == (0, 0))
     smallest = max(float(curve[curve > 0].min(initial=largest)) / 3, largest * FAINTEST)
     look["yaxis"]["range"] = numbers(np.log10([smallest, 2.0 * largest]))
-    _ticks(look["xaxis"], grid)
-    _ticks(look["yaxis"], np.array([smallest, 2.0 * largest]))
+    log_ticks(look["xaxis"], grid)
+    log_ticks(look["yaxis"], np.array([smallest, 2.0 * largest]))
     return {"data": data, "layout": look}
 
 
-def _ticks(axis: Figure, values: FloatArray) -> None:
-    """Write 2 and 5 between the powers of ten where there are few of these."""
+def log_ticks(axis: Figure, values: FloatArray) -> None:
+    """Label a logarithmic axis so that every label is a number of its own: 0.5, 1, 2, 5, 10 ...
+
+    Powers of ten alone where the values range over many decades; one to nine of each where over less
+    than one.
+    """
     shown = values[np.isfinite(values) & (values > 0)]
-    if shown.size and np.log10(shown.max() / shown.min()) < FEW_DECADES:
-        axis["dtick"] = "D2"
+    if not shown.size:
+        return
+    low, high = np.log10(shown.min()), np.log10(shown.max())
+    digits = (1, 2, 5) if high - low < FEW_DECADES else (1,)
+    step = 1 + int((high - low) / MOST_DECADES)
+    first, last = int(np.floor(low)), int(np.ceil(high))
+    ticks = [d * 10.0**k for k in range(first, last + 1, step) for d in digits]
+    if sum(low <= np.log10(t) <= high for t in ticks) < 2:
+        ticks = [d * 10.0**k for k in range(first, last + 1) for d in range(1, 10)]
+    axis |= {"tickmode": "array", "tickvals": ticks, "ticktext": [_tick(t) for t in ticks]}
+
+
+def _tick(value: float) -> str:
+    if SMALLEST_PLAIN <= value <= 1 / SMALLEST_PLAIN:
+        return f"{value:g}"
+    power = int(np.floor(np.log10(value) + 1e-9))
+    factor = "" if np.isclose(value, 10.0**power) else f"{value / 10.0**power:g}·"
+    return f"{factor}10<sup>{power}</sup>"
 
 
 def _grid(measured: FrequencyResponse | None, band: ModelBand | None) -> FloatArray:
@@ -191,8 +216,8 @@ def picture_figure(picture: Picture) -> Figure:
     points = picture.kind == "amplitude"
     data = [_series(s, points=points) for s in picture.series]
     if picture.logarithmic:
-        _ticks(look["xaxis"], np.concatenate([s.x for s in picture.series]))
-        _ticks(look["yaxis"], np.concatenate([s.y for s in picture.series]))
+        log_ticks(look["xaxis"], np.concatenate([s.x for s in picture.series]))
+        log_ticks(look["yaxis"], np.concatenate([s.y for s in picture.series]))
     if picture.kind in ("amplitude", "session"):
         look["yaxis"]["rangemode"] = "tozero"
     return {"data": data, "layout": look}

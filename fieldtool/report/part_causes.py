@@ -62,27 +62,33 @@ def gain(material: Material) -> Section | None:
     if criticism is None or not criticism.held_out.error_before:
         return None
     held = criticism.held_out
-    rows: list[tuple[str, ...]] = []
-    before: dict[str, float | None] = {}
-    after: dict[str, float | None] = {}
-    noise: dict[str, float | None] = {}
-    for name, first in held.error_before.items():
-        last, floor = held.error_after[name], held.noise_floor[name]
-        rows.append(
-            (
-                name,
-                percent(first.torque),
-                percent(last.torque),
-                percent(floor),
-                percent(held.explained.get(name)),
-                percent(first.position),
-                percent(last.position),
-            )
-        )
-        before[name], after[name] = 100 * first.torque, 100 * last.torque
-        noise[name] = None if floor is None else 100 * floor
-    groups = {"before": before, "after": after, "noise floor": noise}
     kept = "whole experiments" if held.split == "experiments" else "stretches in time"
+    unseen = Words((f"Kept unseen were {kept}: {', '.join(held.experiments)}.",))
+    meaning = "An error is the RMS of measured minus simulated over the RMS of measured."
+    if not criticism.causes:
+        plain = tuple(
+            (name, percent(e.torque), percent(held.noise_floor[name]), percent(e.position))
+            for name, e in held.error_before.items()
+        )
+        table = Table(("axis", "torque: error", "noise floor", "position: error"), plain)
+        return Section("The error on data that no fit has seen", meaning, (table, unseen))
+    rows = tuple(
+        (
+            name,
+            percent(first.torque),
+            percent(held.error_after[name].torque),
+            percent(held.noise_floor[name]),
+            percent(held.explained.get(name)),
+            percent(first.position),
+            percent(held.error_after[name].position),
+        )
+        for name, first in held.error_before.items()
+    )
+    groups: dict[str, dict[str, float | None]] = {
+        "before": {name: 100 * e.torque for name, e in held.error_before.items()},
+        "after": {name: 100 * e.torque for name, e in held.error_after.items()},
+        "noise floor": {n: None if v is None else 100 * v for n, v in held.noise_floor.items()},
+    }
     table = Table(
         (
             "axis",
@@ -93,19 +99,15 @@ def gain(material: Material) -> Section | None:
             "position: error before",
             "after",
         ),
-        tuple(rows),
+        rows,
     )
     plot = Plot(
         bars_figure(groups, "error of the torque, %"), "Error of the torque on unseen data", 260
     )
     return Section(
         "What is gained, on data that no fit has seen",
-        "An error is the RMS of measured minus simulated over the RMS of measured.",
-        (
-            table,
-            Plots((plot,), 2),
-            Words((f"Kept unseen were {kept}: {', '.join(held.experiments)}.",)),
-        ),
+        meaning,
+        (table, Plots((plot,), 2), unseen),
     )
 
 

@@ -23,8 +23,11 @@ def facts(material: Material) -> tuple[tuple[str, str], ...]:
     out: list[tuple[str, str]] = []
     for event in material.events_of("session"):
         options = event.get("options")
-        plan = f", {options.get('plan')} plan" if isinstance(options, Mapping) else ""
-        out.append((_clock(event), f"{event.get('command') or 'session'}{plan}"))
+        command = str(event.get("command") or "session")
+        plan = ""
+        if isinstance(options, Mapping) and command not in ("write", "tools"):
+            plan = f", {options.get('plan')} plan"
+        out.append((_clock(event), f"{command}{plan}"))
     machine = material.machine
     if machine is not None:
         axes = ", ".join(f"{a.name} ({a.kind}, node {a.node_id})" for a in machine.axes)

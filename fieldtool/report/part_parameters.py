@@ -19,9 +19,9 @@ def parameters(material: Material) -> Section | None:
     blocks: list[Block] = []
     rows = _rows(material)
     if rows:
-        table = tuple(_row(row) for row in rows)
         columns = ("axis", "parameter", "before", "after", "unit", "read back")
-        blocks.append(Table(columns, table))
+        count = len(columns) if any(row.get("read_back") is not None for row in rows) else -1
+        blocks.append(Table(columns[:count], tuple(_row(row)[:count] for row in rows)))
     else:
         blocks.append(
             Table(

@@ -3,20 +3,25 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from fieldtool.report.figures import layout
+import numpy as np
+
+from fieldtool.report.figures import layout, log_ticks
 from fieldtool.report.material import Material
 from fieldtool.report.section import Block, Plot, Plots, Section, Table, Words
+from fieldtool.report.words import AT_ONCE
 
 COLOURS = {"before": "#9aa5b1", "predicted": "#d1495b", "after": "#1f3b73"}
+TORQUES = {"rad": "N m", "m": "N"}
 FIGURES = (
-    ("settles in, s", "settling_time"),
-    ("overshoot", "overshoot"),
-    ("vibration after the move", "vibration"),
-    ("following error", "following_error"),
-    ("torque", "peak_torque"),
-    ("peak of sensitivity", "sensitivity_peak"),
-    ("at, Hz", "sensitivity_frequency"),
+    ("settles after the move in", "settling_time", "s"),
+    ("overshoot", "overshoot", "position"),
+    ("vibration after the move", "vibration", "position"),
+    ("following error", "following_error", "position"),
+    ("torque", "peak_torque", "torque"),
+    ("peak of sensitivity", "sensitivity_peak", ""),
+    ("peak of sensitivity at", "sensitivity_frequency", "Hz"),
 )
+"""Title, name, unit: that of the axis' position or torque, or this one."""
 
 
 def verification(material: Material) -> Section | None:
@@ -26,12 +31,17 @@ def verification(material: Material) -> Section | None:
         return None
     axes: Sequence[Mapping[str, Any]] = held.get("axes") or ()
     rows = [
-        (str(axis["axis"]), title, *(_cell(axis, when, name) for when in COLOURS))
+        (
+            str(axis["axis"]),
+            title,
+            *(_cell(axis, when, name) for when in COLOURS),
+            _unit(str(axis.get("unit", "")), unit),
+        )
         for axis in axes
-        for title, name in FIGURES
+        for title, name, unit in FIGURES
     ]
     blocks: list[Block] = [
-        Table(("axis", "figure", *COLOURS), tuple(rows), "The same short test each time.")
+        Table(("axis", "figure", *COLOURS, "unit"), tuple(rows), "The same short test each time.")
     ]
     plots = [plot for axis in axes for plot in (_move(axis), _sensitivity(axis)) if plot]
     if plots:
@@ -45,7 +55,13 @@ def verification(material: Material) -> Section | None:
 def _cell(axis: Mapping[str, Any], when: str, name: str) -> str:
     figures = axis.get(when)
     value = figures.get(name) if figures else None
-    return "" if value is None else f"{value:.3g}"
+    if value is None:
+        return ""
+    return AT_ONCE if name == "settling_time" and value == 0 else f"{value:.3g}"
+
+
+def _unit(position: str, unit: str) -> str:
+    return {"position": position, "torque": TORQUES.get(position, "")}.get(unit, unit)
 
 
 def _lines(curves: Mapping[str, tuple[Any, Any]]) -> list[dict[str, Any]]:
@@ -66,7 +82,10 @@ def _move(axis: Mapping[str, Any]) -> Plot | None:
     known = {name: (curves["time"], curves[name]) for name in COLOURS if name in curves}
     if not known:
         return None
-    figure = {"data": _lines(known), "layout": layout("s", str(axis.get("unit", "")))}
+    figure = {
+        "data": _lines(known),
+        "layout": layout("time, s", f"position, {axis.get('unit', '')}"),
+    }
     return Plot(figure, f"{axis['axis']}: its typical move")
 
 
@@ -79,5 +98,8 @@ def _sensitivity(axis: Mapping[str, Any]) -> Plot | None:
     }
     if not known:
         return None
-    figure = {"data": _lines(known), "layout": layout("Hz", "", logarithmic=True)}
+    look = layout("frequency, Hz", "sensitivity", logarithmic=True)
+    for which, k in (("xaxis", 0), ("yaxis", 1)):
+        log_ticks(look[which], np.concatenate([np.asarray(c[k], float) for c in known.values()]))
+    figure = {"data": _lines(known), "layout": look}
     return Plot(figure, f"{axis['axis']}: sensitivity, all other loops closed")

@@ -1,6 +1,6 @@
 """Where the simulation is wrong: the same error looked at in many ways."""
 
-from fieldtool.criticise.pictures_file import Picture
+from fieldtool.criticise.pictures_file import NOISE_ONLY, Picture
 from fieldtool.report.figures import picture_figure
 from fieldtool.report.material import Material
 from fieldtool.report.section import Block, Plot, Plots, Section, Words
@@ -19,22 +19,30 @@ TITLES = {
 
 
 def wrong(material: Material) -> Section | None:
-    """Show the errors of every axis, before and after, with one sentence each."""
+    """Show the errors of every axis, before and after, with one sentence each.
+
+    Where nothing is wrong, the pictures of what is left are folded away.
+    """
     criticism = material.criticism
     if criticism is None:
         return None
-    blocks: list[Block] = [
-        Words(
-            (
-                "The torque that the simulated machine needs for the measured motion is taken off the "
-                "measured torque: what is left is the error. Before: the machine of masses, springs, "
-                "dampers and couplings alone. After: with the causes named below.",
-            )
+    where = Words(tuple(f"{s}." for s in criticism.where), "list")
+    said = (
+        "The torque that the simulated machine needs for the measured motion is taken off the measured "
+        "torque: what is left is the error."
+    )
+    if criticism.causes:
+        said += (
+            " Before: the machine of masses, springs, dampers and couplings alone. After: with the "
+            "causes named below."
         )
-    ]
+    blocks: list[Block] = [where, Words((said,))]
     for axis in dict.fromkeys(p.axis for p in material.pictures):
-        plots = tuple(_plot(p) for p in material.pictures if p.axis == axis)
-        blocks.append(Plots(plots, 2))
+        shown = tuple(p for p in material.pictures if p.axis == axis)
+        if criticism.verdict != "adequate" and all(map(_noise_only, shown)):
+            blocks.append(Words((f"{axis}: {NOISE_ONLY}, however it is looked at.",)))
+        else:
+            blocks.append(Plots(tuple(_plot(p) for p in shown), 2))
     if not material.pictures:
         blocks.append(
             Words(
@@ -42,8 +50,15 @@ def wrong(material: Material) -> Section | None:
                 "warning",
             )
         )
-    where = Words(tuple(f"{s}." for s in criticism.where), "list")
-    return Section("Where the simulation is wrong", "", (where, *blocks))
+    if criticism.verdict == "adequate":
+        lead = "Nothing that matters: noise, or below 1 % of the torque."
+        return Section("What the simulation leaves", lead, tuple(blocks), folded=True)
+    return Section("Where the simulation is wrong", "", tuple(blocks))
+
+
+def _noise_only(picture: Picture) -> bool:
+    """Whether a picture shows nothing but noise; the course in time shows whatever there is."""
+    return picture.kind in ("time", "lines") or picture.sentence == NOISE_ONLY
 
 
 def _plot(picture: Picture) -> Plot:

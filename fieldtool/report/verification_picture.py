@@ -174,7 +174,7 @@ def _draw_sensitivity(plot: Axes, one: Comparison) -> None:
             plot.loglog(
                 curve.frequency, curve.size, style, color=colour, lw=1.2, ms=2.5, label=name
             )
-    plot.axhline(2.0, color=REFERENCE, ls=":", lw=1.0)
+    plot.axhline(2.0, color=REFERENCE, ls=":", lw=1.0, label="2 (6 dB)")
     plot.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     plot.xaxis.set_major_formatter(FormatStrFormatter("%g"))
     plot.xaxis.set_minor_formatter(NullFormatter())

@@ -29,6 +29,10 @@ WORDS = {
 }
 
 
+AT_ONCE = "at once"
+"""Of a settling time of 0: the axis is in its band when its reference ends."""
+
+
 def effect_words(effect: str) -> str:
     """Return the name of an effect as people say it."""
     return WORDS.get(effect, effect.replace("_", " "))

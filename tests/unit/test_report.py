@@ -19,7 +19,7 @@ from fieldtool.cli.main import main
 from fieldtool.criticise.criticise import criticise
 from fieldtool.criticise.criticism_file import read_criticism
 from fieldtool.criticise.pictured import pictures_of
-from fieldtool.criticise.pictures_file import load_pictures, save_pictures
+from fieldtool.criticise.pictures_file import NOISE_ONLY, load_pictures, save_pictures
 from fieldtool.design.tuning import AxisTuning, Tuning
 from fieldtool.errors import FileFormatError
 from fieldtool.records.model import Estimate
@@ -27,9 +27,12 @@ from fieldtool.records.model_file import write_model
 from fieldtool.records.recording import save
 from fieldtool.records.session_folder import SessionFolder
 from fieldtool.records.yaml_file import write_yaml
+from fieldtool.report.figures import log_ticks
 from fieldtool.report.material import Material
 from fieldtool.report.page import Page, html_of
 from fieldtool.report.part_parameters import parameters
+from fieldtool.report.part_verification import verification
+from fieldtool.report.part_wrong import wrong
 from fieldtool.report.section import Plot, Section, Table, Words
 from fieldtool.workflow.reporting import material_of, report
 from tests.unit.late_axis import FINE, MODEL, STEP, recorded
@@ -352,3 +355,51 @@ def test_an_event_that_was_cut_off_costs_no_other(session, tmp_path):
     assert [
         one for one in material.missing if one.startswith("events.jsonl: lines that are no events")
     ]
+
+
+@given(
+    st.floats(-9, 9).flatmap(lambda low: st.tuples(st.just(low), st.floats(low + 0.05, low + 12)))
+)
+@settings(deadline=None)
+def test_a_logarithmic_axis_has_labels_that_are_numbers_of_their_own(span):
+    low, high = span
+    axis = {}
+    log_ticks(axis, 10 ** np.array([low, high]))
+    labels = [text.replace("<sup>", "e").replace("</sup>", "") for text in axis["ticktext"]]
+    read = [float(text.replace("·10e", "e").replace("10e", "1e")) for text in labels]
+    assert read == pytest.approx(axis["tickvals"])
+    seen = sum(low - 1e-9 <= np.log10(v) <= high + 1e-9 for v in axis["tickvals"])
+    assert seen <= 18
+    assert seen >= 2 or high - low < 0.35
+
+
+def test_before_and_after_have_units_and_a_move_that_ends_in_its_band_settles_at_once():
+    figures = {"settling_time": 0.0, "overshoot": 0.012, "peak_torque": 3.5}
+    part = verification(
+        Material(
+            "s",
+            documents={
+                "verification": {
+                    "axes": [{"axis": "slide", "unit": "m", "before": None, "after": figures}]
+                }
+            },
+        )
+    )
+    table = next(block for block in part.blocks if block.is_a == "table")
+    rows = {row[1]: row for row in table.rows}
+    assert rows["settles after the move in"][-2:] == ("at once", "s")
+    assert rows["overshoot"][-2:] == ("0.012", "m")
+    assert rows["torque"][-2:] == ("3.5", "N")
+
+
+@pytest.mark.parametrize("verdict", ["adequate", "unexplained"])
+def test_pictures_of_noise_stand_under_no_heading_of_what_is_wrong(session, verdict):
+    found = material_of(session[0])
+    quiet = [replace(p, sentence=NOISE_ONLY) for p in found.pictures]
+    criticism = replace(found.criticism, verdict=verdict, causes=())
+    part = wrong(replace(found, criticism=criticism, pictures=tuple(quiet)))
+    assert part.folded == (verdict == "adequate")
+    assert ("wrong" in part.title) == (verdict != "adequate")
+    assert any(block.is_a == "plots" for block in part.blocks) == (verdict == "adequate")
+    if verdict != "adequate":
+        assert any(NOISE_ONLY in str(block) for block in part.blocks)
