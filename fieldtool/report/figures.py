@@ -167,8 +167,8 @@ def _tick(value: float) -> str:
     if SMALLEST_PLAIN <= value <= 1 / SMALLEST_PLAIN:
         return f"{value:g}"
     power = int(np.floor(np.log10(value) + 1e-9))
-    factor = "" if np.isclose(value, 10.0**power) else f"{value / 10.0**power:g}·"
-    return f"{factor}10<sup>{power}</sup>"
+    factor = f"{value / 10.0**power:g}"
+    return f"{'' if factor == '1' else factor + '·'}10<sup>{power}</sup>"
 
 
 def _grid(measured: FrequencyResponse | None, band: ModelBand | None) -> FloatArray:
