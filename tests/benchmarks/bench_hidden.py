@@ -15,11 +15,14 @@ alone, from the machine as it was accepted before.
 Every case is one line of JSON in FILE, with its seed: runs add up, and a table of all of them is printed
 at the end.  Without arguments, a few of each into a file that is thrown away.
 
-Run: python tests/benchmarks/bench_hidden.py [KIND=CASES ...] [file=FILE] [seed=SEED]
+``keep=DIRECTORY`` keeps what was drawn and recorded, so that other code can be tried on the same cases.
+
+Run: python tests/benchmarks/bench_hidden.py [KIND=CASES ...] [file=FILE] [seed=SEED] [keep=DIRECTORY]
 """
 
 import json
 import os
+import pickle
 import sys
 import tempfile
 import time
@@ -116,7 +119,22 @@ def judged(kind, case, without=frozenset(), with_told=False):
     return line
 
 
-def case_of(kind, number, seed, effect=None):
+def kept(keep):
+    """Draw cases, or take them from a directory where they were drawn before."""
+
+    def drawn(seed, effects, wanted=None):
+        if keep is None:
+            return draw(seed, effects, wanted)
+        name = "-".join(["case", str(seed), *(e or "any" for e in effects), str(wanted or "any")])
+        path = keep / f"{name}.pkl"
+        if not path.is_file():
+            path.write_bytes(pickle.dumps(draw(seed, effects, wanted)))
+        return pickle.loads(path.read_bytes())  # noqa: S301: it wrote it itself
+
+    return drawn
+
+
+def case_of(kind, number, seed, effect=None, draw=draw):
     """One case of a kind; the effect goes round, or is that which is asked for."""
     name = effect or EFFECTS[number % len(EFFECTS)]
     if kind == "one":
@@ -264,6 +282,9 @@ def main():
     file = Path(words.pop("file", "") or Path(tempfile.mkdtemp()) / "hidden.jsonl")
     seed = int(words.pop("seed", 0)) or int(np.random.SeedSequence().entropy % 2**31)
     effect = words.pop("effect", None)
+    keep = Path(words.pop("keep")) if "keep" in words else None
+    if keep is not None:
+        keep.mkdir(parents=True, exist_ok=True)
     todo = {k: int(v) for k, v in words.items()} or FEW
     print(f"seed {seed}, {file}")
     have = [json.loads(row) for row in file.read_text().splitlines()] if file.is_file() else []
@@ -271,7 +292,7 @@ def main():
     for kind, count in todo.items():
         already = sum(x["kind"] == kind for x in have)
         for k in range(count):
-            line = case_of(kind, already + k, seed + 7919 * (already + k), effect)
+            line = case_of(kind, already + k, seed + 7919 * (already + k), effect, kept(keep))
             have.append(line)
             with file.open("a") as out:
                 out.write(json.dumps(line, default=float) + "\n")

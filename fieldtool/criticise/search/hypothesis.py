@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,13 +12,15 @@ from fieldtool.criticise.effects.base import Effect
 from fieldtool.criticise.evidence.lines import Lines, flat
 from fieldtool.criticise.evidence.spans import Role
 from fieldtool.criticise.search.machine import Machine
-from fieldtool.criticise.simulate.inverse import HiddenSystem, needed_torque
+from fieldtool.criticise.simulate.inverse import Driven
 from fieldtool.criticise.simulate.motion import Motion
 from fieldtool.criticise.simulate.structure import Structure
 
 FloatArray = NDArray[np.float64]
 KEPT = 48
 """Simulations of the chains that are remembered."""
+READY = 4
+"""Structures that are remembered ready to be driven."""
 SEVERAL = ("cogging", "encoder_error", "extra_mode", "periodic_disturbance")
 """Effects of which there may be more than one at a place."""
 THINNED = 3
@@ -86,8 +89,9 @@ class Simulator:
 
     def __post_init__(self) -> None:
         self._kept: dict[bytes, FloatArray] = {}
-        self._free_key = b""
-        self._free: tuple[HiddenSystem, FloatArray]
+        self._ready: dict[bytes, Driven] = {}
+        self._courses: dict[bytes, FloatArray] = {}
+        self._built: tuple[Hypothesis | None, Structure | None] = (None, None)
 
     def errors(self, hypothesis: Hypothesis) -> dict[str, FloatArray]:
         """Return the torque measured less simulated, (n, M), by experiment."""
@@ -96,21 +100,14 @@ class Simulator:
     def torque(self, hypothesis: Hypothesis, motion: Motion) -> FloatArray:
         """Return the torque that the drives would report for the measured motion, (n, M)."""
         pairs = list(zip(hypothesis.effects, hypothesis.values, strict=True))
-        moved = motion
-        chains = hypothesis.base[: -len(hypothesis.machine.model.axes)]
-        key = [motion.experiment.encode(), chains.tobytes()]
+        moved, moves = motion, motion.experiment
         for effect, values in pairs:
             other = effect.motion(moved, values)
             if other is not moved:
-                key.append(repr((effect.key, sorted(values.items()))).encode())
+                moves += repr((effect.key, sorted(values.items())))
                 moved = other
-        structure = Structure.of(hypothesis.machine.with_values(hypothesis.base))
-        for effect, values in pairs:
-            grown = effect.structure(structure, values)
-            if grown is not structure:
-                key.append(repr((effect.key, sorted(values.items()))).encode())
-                structure = grown
-        needed = self._remembered(b"|".join(key), structure, moved).copy()
+        structure = self._structure(hypothesis).between(*motion.clock[[0, -1]])
+        needed = self._remembered(moves.encode(), structure, moved).copy()
         for effect, values in pairs:
             besides = effect.torque(moved, values)
             if besides is not None:
@@ -140,22 +137,40 @@ class Simulator:
             out.append((lines, _without_unknown(hypothesis, lines, values)))
         return out
 
-    def _remembered(self, key: bytes, structure: Structure, motion: Motion) -> FloatArray:
+    def _structure(self, hypothesis: Hypothesis) -> Structure:
+        """Return the machine with what effects change of it; the last one is remembered."""
+        known, structure = self._built
+        if structure is None or known is not hypothesis:
+            structure = Structure.of(hypothesis.machine.with_values(hypothesis.base))
+            for effect, values in zip(hypothesis.effects, hypothesis.values, strict=True):
+                structure = effect.structure(structure, values)
+            self._built = hypothesis, structure
+        return structure
+
+    def _remembered(self, moves: bytes, structure: Structure, motion: Motion) -> FloatArray:
+        key = moves + b"|" + structure.key
         if key not in self._kept:
-            while len(self._kept) >= KEPT:
-                self._kept.pop(next(iter(self._kept)))
+            _make_room(self._kept, KEPT)
             self._kept[key] = self._less_free_motion(structure, motion)
         return self._kept[key]
+
+    def _driven(self, structure: Structure, step: float) -> Driven:
+        """Return a structure ready to be driven."""
+        if structure.key not in self._ready:
+            _make_room(self._ready, READY)
+            self._ready[structure.key] = Driven.of(structure, step)
+        return self._ready[structure.key]
 
     def _less_free_motion(self, structure: Structure, motion: Motion) -> FloatArray:
         """Return the needed torque from the hidden masses' first state that suits the data best.
 
         The first state is not measured; a wrong one rings on at the structure's own frequencies.
         """
-        needed = needed_torque(structure, motion)
+        driven = self._driven(structure, motion.step)
+        needed = driven.needed(motion)
         if not structure.hidden.size or not np.all(np.isfinite(needed)):
             return needed  # what runs away is no better than anything
-        system, courses = self._free_motions(structure, motion.step)
+        courses = self._free_motions(driven)
         some = slice(0, courses.shape[1] * THINNED, THINNED)
         counted = motion.counted[some]
         columns = (courses[:, : counted.shape[0]] * counted).reshape(courses.shape[0], -1)
@@ -163,26 +178,27 @@ class Simulator:
         size = np.linalg.norm(columns, axis=1)
         size[size == 0.0] = 1.0
         columns /= size[:, None]
-        start = np.zeros((1, system.rates.shape[0]))
+        start = np.zeros((1, driven.system.rates.shape[0]))
         solved = np.linalg.lstsq(columns @ columns.T, columns @ side, rcond=1e-12)[0] / size
         start[0, : solved.size] = solved
         rows = min(motion.rows, courses.shape[1] * THINNED)
-        needed[:rows] += system.free_from(start, motion.step, rows)[0]
+        needed[:rows] += driven.system.free_from(start, motion.step, rows)[0]
         return needed
 
-    def _free_motions(self, structure: Structure, step: float) -> tuple[HiddenSystem, FloatArray]:
-        """Return the hidden masses, and what each state of theirs rings on as, every third row."""
-        key = b"".join(
-            m.tobytes() for m in (structure.mass, structure.damping, structure.stiffness)
-        )
-        key += repr(structure.branches).encode()
-        if key != self._free_key:
-            rows = max(m.rows for m in self.motions.values())
-            system = HiddenSystem.of(structure)
-            thinned = -(-rows // THINNED)
-            self._free_key = key
-            self._free = system, system.free_torques(step * THINNED, thinned)
-        return self._free
+    def _free_motions(self, driven: Driven) -> FloatArray:
+        """Return what each state of the hidden masses rings on as, every third row."""
+        key = replace(driven.structure, elements=()).key
+        if key not in self._courses:
+            _make_room(self._courses, READY)
+            thinned = -(-max(m.rows for m in self.motions.values()) // THINNED)
+            self._courses[key] = driven.system.free_torques(driven.step * THINNED, thinned)
+        return self._courses[key]
+
+
+def _make_room(kept: dict[bytes, Any], most: int) -> None:
+    """Forget the oldest until one more may be kept."""
+    while len(kept) >= most:
+        kept.pop(next(iter(kept)))
 
 
 def _without_unknown(hypothesis: Hypothesis, lines: Lines, values: FloatArray) -> FloatArray:

@@ -128,36 +128,67 @@ class HiddenSystem:
         return of_state, of_input, of_force
 
 
-def needed_torque(structure: Structure, motion: Motion) -> FloatArray:
-    """Return the torque that each motor needs for the measured motion, (n, M).
+@dataclass(frozen=True, eq=False)
+class Driven:
+    """A structure, ready to be driven by motions of one step: what all of them have in common."""
 
-    The hidden masses start with their springs as relaxed as the first row lets them, at their motor's
-    velocity; what this is wrong by decays with their damping (see :meth:`HiddenSystem.free_torques`).
-    """
-    u = motion.inputs
-    system = HiddenSystem.of(structure)
-    of_state, of_input, of_force = system.readout
-    if structure.hidden.size == 0 and not structure.elements:
-        return np.asarray(u @ of_input.T)
-    start = _start(structure, motion)
-    if not structure.elements:
-        advance, early, late, _, _ = system.held(motion.step)
-        return np.asarray(march(advance, early, late, of_state, of_input, motion.driven, u, start))
-    substeps = _substeps(system, motion.step)
-    tables = system.held(motion.step / substeps)
-    z, g = march_bent(
-        *tables,
-        motion.driven,
-        start,
-        motion.clock,
-        substeps,
-        structure.motors.astype(np.int64),
-        structure.hidden.astype(np.int64),
-        np.array([int(e.law) for e in structure.elements], dtype=np.int64),
-        np.array([(e.first, e.second) for e in structure.elements], dtype=np.int64),
-        np.array([e.values for e in structure.elements], dtype=np.float64),
-    )
-    return np.asarray(u @ of_input.T + z @ of_state.T + g @ of_force.T)
+    structure: Structure
+    system: HiddenSystem
+    step: float
+    """Of the motions, s."""
+
+    @classmethod
+    def of(cls, structure: Structure, step: float) -> "Driven":
+        """Cut the structure at its motors."""
+        return cls(structure, HiddenSystem.of(structure), step)
+
+    @cached_property
+    def substeps(self) -> int:
+        """Sub-steps that resolve the fastest swing: what only decays is exact, and follows the masses."""
+        rates = np.linalg.eigvals(self.system.rates)
+        fastest = float(np.abs(rates[rates.imag != 0.0]).max(initial=0.0))
+        return int(np.clip(np.ceil(fastest * self.step / LARGEST_TURN), 1, MOST_SUBSTEPS))
+
+    @cached_property
+    def tables(self) -> tuple[FloatArray, ...]:
+        """What one step, or one sub-step where there are elements, adds to the state."""
+        return self.system.held(self.step / (self.substeps if self.structure.elements else 1))
+
+    def needed(self, motion: Motion) -> FloatArray:
+        """Return the torque that each motor needs for the measured motion, (n, M).
+
+        The hidden masses start with their springs as relaxed as the first row lets them, at their
+        motor's velocity; what this is wrong by decays with their damping (see
+        :meth:`HiddenSystem.free_torques`).
+        """
+        u, structure = motion.inputs, self.structure
+        of_state, of_input, of_force = self.system.readout
+        if structure.hidden.size == 0 and not structure.elements:
+            return np.asarray(u @ of_input.T)
+        start = _start(structure, motion)
+        if not structure.elements:
+            advance, early, late, _, _ = self.tables
+            return np.asarray(
+                march(advance, early, late, of_state, of_input, motion.driven, u, start)
+            )
+        z, g = march_bent(
+            *self.tables,
+            motion.driven,
+            start,
+            motion.clock,
+            self.substeps,
+            structure.motors.astype(np.int64),
+            structure.hidden.astype(np.int64),
+            np.array([int(e.law) for e in structure.elements], dtype=np.int64),
+            np.array([(e.first, e.second) for e in structure.elements], dtype=np.int64),
+            np.array([e.values for e in structure.elements], dtype=np.float64),
+        )
+        return np.asarray(u @ of_input.T + z @ of_state.T + g @ of_force.T)
+
+
+def needed_torque(structure: Structure, motion: Motion) -> FloatArray:
+    """Return the torque that each motor needs for the measured motion, (n, M)."""
+    return Driven.of(structure, motion.step).needed(motion)
 
 
 def dynamic_stiffness(structure: Structure, omega: FloatArray) -> NDArray[np.complex128]:
@@ -172,11 +203,6 @@ def dynamic_stiffness(structure: Structure, omega: FloatArray) -> NDArray[np.com
         moved = np.linalg.solve(inner, whole[:, hidden[:, None], motors])
         out = out - whole[:, motors[:, None], hidden] @ moved
     return np.asarray(out)
-
-
-def _substeps(system: HiddenSystem, step: float) -> int:
-    fastest = float(np.abs(np.linalg.eigvals(system.rates)).max(initial=0.0))
-    return int(np.clip(np.ceil(fastest * step / LARGEST_TURN), 1, MOST_SUBSTEPS))
 
 
 def _start(structure: Structure, motion: Motion) -> FloatArray:

@@ -121,46 +121,30 @@ def both_ways(sections: FloatArray, at_rest: FloatArray, values: FloatArray) -> 
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
-def forces(
-    laws: IntArray,
-    ends: IntArray,
-    values: FloatArray,
-    x: FloatArray,
-    v: FloatArray,
-    t: float,
-    out: FloatArray,
-) -> None:
-    """Write the forces of all elements on all masses into ``out``, (n,)."""
-    for i in range(out.size):
-        out[i] = 0.0
-    for e in range(laws.size):
-        a, b = ends[e, 0], ends[e, 1]
-        p0, p1, p2 = values[e, 0], values[e, 1], values[e, 2]
-        s, rate = -x[a], -v[a]
-        if b >= 0:
-            s += x[b]
-            rate += v[b]
-        pull = 0.0
-        if laws[e] == CUBIC:
-            pull = p0 * s * s * s
-        elif laws[e] == GAP:
-            if s > p2:
-                pull = -p0 * p2
-            elif s < -p2:
-                pull = p0 * p2
-            else:
-                pull = -p0 * s - p1 * rate
-        elif laws[e] == STEP:
-            if t >= p1:
-                pull = p0 * s
-        elif laws[e] == DRY:
-            pull = p0 * np.tanh(rate / p1)
-        out[a] += pull
-        if b >= 0:
-            out[b] -= pull
+def pull(
+    law: int, values: FloatArray, s: float, rate: float, t: float, span: float, elapsed: float
+) -> float:
+    """Return the force with which an element pulls its ends together.
+
+    ``t`` is when the sample began, ``elapsed`` the time since, ``span`` that to the next sample.
+    """
+    p0, p1, p2 = values[0], values[1], values[2]
+    if law == CUBIC:
+        return p0 * s * s * s
+    if law == GAP:
+        if s > p2:
+            return -p0 * p2
+        if s < -p2:
+            return p0 * p2
+        return -p0 * s - p1 * rate
+    if law == STEP:
+        return p0 * s if t + elapsed * span >= p1 else 0.0
+    if law == DRY:
+        return p0 * np.tanh(rate / p1)
+    return 0.0
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, fastmath=True)  # type: ignore[untyped-decorator]
 def march_bent(
     step: FloatArray,
     of_start: FloatArray,
@@ -182,53 +166,87 @@ def march_bent(
     ``of_start`` and ``of_end`` (S, 3 M) are for the inputs at both ends of a sub-step, ``of_force_*``
     (S, H) for the forces on the hidden masses; ``inputs`` (n, 3 M) are q, q', q'' of the motors.
     """
-    n, size = inputs.shape[0], start.size
+    n, size, E = inputs.shape[0], start.size, laws.size
     count, M, H = motors.size + hidden.size, motors.size, hidden.size
-    states, pushed = np.empty((n, size)), np.empty((n, count))
-    z, ahead, moved = start.copy(), np.empty(size), np.empty(size)
-    x, v = np.empty(count), np.empty(count)
-    g, g_ahead = np.empty(count), np.empty(count)
-    u, u_next = np.empty(3 * M), np.empty(3 * M)
-    h = (clock[1] - clock[0]) / substeps
+    states, pushed = np.empty((n, size)), np.zeros((n, count))
+    # Where each mass finds its motion: the number of a motor, or M + the number of a hidden mass.
+    place = np.empty(count, dtype=np.int64)
+    for i in range(M):
+        place[motors[i]] = i
+    for i in range(H):
+        place[hidden[i]] = M + i
+    # What one unit of an element's pull, at either end of a sub-step, does to the state.
+    early, late = np.zeros((E, size)), np.zeros((E, size))
+    for e in range(E):
+        for end in range(2):
+            dof = ends[e, end]
+            if dof >= 0 and place[dof] >= M:
+                sign = 1.0 if end == 0 else -1.0
+                for i in range(size):
+                    early[e, i] += sign * of_force_start[i, place[dof] - M]
+                    late[e, i] += sign * of_force_end[i, place[dof] - M]
+    z, ahead = start.copy(), np.empty(size)
+    middle, rising, rise = np.empty(size), np.empty(size), np.empty(3 * M)
+    now, then = np.empty(E), np.empty(E)
+    period = clock[1] - clock[0]
     for k in range(n):
         for i in range(size):
             states[k, i] = z[i]
         following = k + 1 if k + 1 < n else k
+        for j in range(3 * M):
+            rise[j] = (inputs[following, j] - inputs[k, j]) / substeps
+        for i in range(size):
+            middle[i], rising[i] = 0.0, 0.0
+            for j in range(3 * M):
+                both = of_start[i, j] + of_end[i, j]
+                middle[i] += both * inputs[k, j] + of_end[i, j] * rise[j]
+                rising[i] += both * rise[j]
         for part in range(substeps):
-            share, share_next = part / substeps, (part + 1) / substeps
-            for i in range(3 * M):
-                rise = inputs[following, i] - inputs[k, i]
-                u[i] = inputs[k, i] + share * rise
-                u_next[i] = inputs[k, i] + share_next * rise
-            for i in range(M):
-                x[motors[i]], v[motors[i]] = u[i], u[M + i]
-            for i in range(H):
-                x[hidden[i]], v[hidden[i]] = z[i], z[H + i]
-            forces(laws, ends, values, x, v, clock[k] + part * h, g)
-            if part == 0:
-                for i in range(count):
-                    pushed[k, i] = g[i]
+            for e in range(E):
+                s, rate = 0.0, 0.0
+                for end in range(2):
+                    dof = ends[e, end]
+                    if dof >= 0:
+                        sign = -1.0 if end == 0 else 1.0
+                        if place[dof] >= M:
+                            s += sign * z[place[dof] - M]
+                            rate += sign * z[H + place[dof] - M]
+                        else:
+                            j = place[dof]
+                            s += sign * (inputs[k, j] + part * rise[j])
+                            rate += sign * (inputs[k, M + j] + part * rise[M + j])
+                now[e] = pull(laws[e], values[e], s, rate, clock[k], period, part / substeps)
+                if part == 0:
+                    pushed[k, ends[e, 0]] += now[e]
+                    if ends[e, 1] >= 0:
+                        pushed[k, ends[e, 1]] -= now[e]
             for i in range(size):
-                total = 0.0
+                total = middle[i] + part * rising[i]
                 for j in range(size):
                     total += step[i, j] * z[j]
-                for j in range(3 * M):
-                    total += of_start[i, j] * u[j] + of_end[i, j] * u_next[j]
-                for j in range(H):
-                    total += (of_force_start[i, j] + of_force_end[i, j]) * g[hidden[j]]
+                for e in range(E):
+                    total += (early[e, i] + late[e, i]) * now[e]
                 ahead[i] = total
-            for i in range(M):
-                x[motors[i]], v[motors[i]] = u_next[i], u_next[M + i]
-            for i in range(H):
-                x[hidden[i]], v[hidden[i]] = ahead[i], ahead[H + i]
-            forces(laws, ends, values, x, v, clock[k] + (part + 1) * h, g_ahead)
+            for e in range(E):
+                s, rate = 0.0, 0.0
+                for end in range(2):
+                    dof = ends[e, end]
+                    if dof >= 0:
+                        sign = -1.0 if end == 0 else 1.0
+                        if place[dof] >= M:
+                            s += sign * ahead[place[dof] - M]
+                            rate += sign * ahead[H + place[dof] - M]
+                        else:
+                            j = place[dof]
+                            s += sign * (inputs[k, j] + (part + 1) * rise[j])
+                            rate += sign * (inputs[k, M + j] + (part + 1) * rise[M + j])
+                later = (part + 1) / substeps
+                then[e] = pull(laws[e], values[e], s, rate, clock[k], period, later)
             for i in range(size):
                 total = ahead[i]
-                for j in range(H):
-                    total += of_force_end[i, j] * (g_ahead[hidden[j]] - g[hidden[j]])
-                moved[i] = total
-            for i in range(size):
-                z[i] = moved[i]
+                for e in range(E):
+                    total += late[e, i] * (then[e] - now[e])
+                z[i] = total
     return states, pushed
 
 

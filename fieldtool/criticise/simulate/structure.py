@@ -80,6 +80,27 @@ class Structure:
         )
 
     @cached_property
+    def key(self) -> bytes:
+        """What tells it from every structure that behaves in another way."""
+        matrices = (self.mass, self.damping, self.stiffness)
+        numbers = b"".join(m.tobytes() for m in matrices)
+        return numbers + repr((self.elements, self.branches)).encode()
+
+    def between(self, begin: float, end: float) -> "Structure":
+        """Return the structure as it is from one time to another: steps outside of it are no elements."""
+        left, stiffness = [], self.stiffness
+        for e in self.elements:
+            if e.law is not Law.STEP or begin < e.values[1] <= end:
+                left.append(e)
+            elif e.values[1] <= begin:
+                stiffness = stiffness.copy()
+                pair = np.ix_([e.first, e.second], [e.first, e.second])
+                stiffness[pair] += e.values[0] * np.array([[1.0, -1.0], [-1.0, 1.0]])
+        if len(left) == len(self.elements):
+            return self
+        return replace(self, stiffness=stiffness, elements=tuple(left))
+
+    @cached_property
     def hidden(self) -> NDArray[np.intp]:
         """Degrees of freedom whose motion nobody measures, (H,)."""
         return np.setdiff1d(np.arange(self.mass.shape[0]), self.motors).astype(np.intp)
