@@ -1,6 +1,6 @@
 """Criticise a model with a recording: where it is wrong, why, and what is gained by knowing."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -45,8 +45,15 @@ SMALL = 0.01
 """Error of the torque beyond its noise that does not matter."""
 NEAR_NOISE = 1.5
 """Error over noise (RMS) up to which it is all noise."""
-ENOUGH, ENOUGH_KNOWN = 0.9, 0.97
-"""Share of the explainable error that has to be explained for "explained"."""
+ENOUGH, ENOUGH_KNOWN, ENOUGH_SURE = 0.9, 0.97, 0.99
+"""Share of the explainable error that has to be explained for "explained": where the noise is not known,
+where it is, and where it is and the causes' forms are no approximations."""
+SURE_FORMS = (
+    "viscous_friction", "gravity", "torque_scale", "torque_lag", "measurement_delay", "extra_mode",
+    "coupling_spring", "coupling_inertia", "structural_damping", "stiffness_change",
+)  # fmt: skip
+FALSE_ZERO = 3.0
+"""Standard errors of a torque's zero, from which a constant torque is told beside causes."""
 OTHER_UNIT = 5.0
 """Factor between measured and needed torque from which it is no fault of the machine."""
 FLAT = 0.02
@@ -111,14 +118,20 @@ def criticise(
     after = _axis_errors(found, found.after)
     causes = tuple(_cause(found, a, recording) for a in found.accepted)
     held = _held_out(found)
-    verdict = _verdict(causes, held)
+    zeros = _false_zeros(found)
+    verdict = _verdict(causes, held, zeros)
     return Criticised(
         Criticism(
             verdict=verdict,
             where=tuple(e.sentence for e in before),
             causes=causes,
-            unexplained=tuple(
-                e.sentence for e in after if verdict != "adequate" and _matters(e.error, e.noise)
+            unexplained=(
+                *(
+                    e.sentence
+                    for e in after
+                    if verdict != "adequate" and _matters(e.error, e.noise)
+                ),
+                *(zeros.values() if causes else ()),
             ),
             held_out=held,
             rejected=tuple(
@@ -327,25 +340,45 @@ def _held_out(found: Found) -> HeldOut:
     )
 
 
-def _verdict(causes: Sequence[Cause], held: HeldOut) -> Verdict:
+def _false_zeros(found: Found) -> dict[str, str]:
+    """Say by axis of constant torques that are more than the zero of a measurement may be off."""
+    hypothesis, said = found.after.hypothesis, {}
+    machine = hypothesis.machine
+    zeros = machine.offsets(hypothesis.base)
+    for axis, variable, off in zip(
+        found.prepared.recording.axes, machine.variables[-len(zeros) :], zeros, strict=True
+    ):
+        if abs(off) > FALSE_ZERO * variable.known * variable.scale:
+            said[axis.name] = (
+                f"{axis.name}: a constant torque of {off:.3g} {axis.torque_unit} is not explained; the "
+                f"zero of its measurement should be right within {100 * variable.known:.2g} % of the "
+                "largest torque"
+            )
+    return said
+
+
+def _verdict(causes: Sequence[Cause], held: HeldOut, zeros: Mapping[str, str]) -> Verdict:
     names = list(held.error_before)
     left = {n for n in names if _matters(held.error_after[n].torque, held.noise_floor[n])}
     if not causes:
         return "unexplained" if left else "adequate"
     # Beside a cause that has a name even little counts: it may be of another cause than of that one.
+    of_axis = {n: [c for c in causes if n in _axes(c)] for n in names}
     left |= {
         n
         for n, noise in held.noise_floor.items()
-        if noise is not None
-        and held.error_after[n].torque > NEAR_NOISE * noise
-        and held.explained[n] < ENOUGH_KNOWN
-        and any(n in (c.axis if isinstance(c.axis, tuple) else (c.axis,)) for c in causes)
+        if noise is not None and held.error_after[n].torque > NEAR_NOISE * noise and of_axis[n]
     }
-    if all(held.explained[n] >= ENOUGH for n in left if held.noise_floor[n] is None) and all(
-        held.explained[n] >= ENOUGH_KNOWN for n in left if held.noise_floor[n] is not None
-    ):
-        return "explained"
-    return "partly explained"
+    for n in left:
+        sure = all(c.effect in SURE_FORMS for c in of_axis[n])
+        enough = ENOUGH if held.noise_floor[n] is None else ENOUGH_SURE if sure else ENOUGH_KNOWN
+        if held.explained[n] < enough:
+            return "partly explained"
+    return "partly explained" if any(of_axis[n] for n in zeros) else "explained"
+
+
+def _axes(cause: Cause) -> tuple[str, ...]:
+    return (cause.axis,) if isinstance(cause.axis, str) else cause.axis
 
 
 def _notes(recording: Recording, found: Found) -> tuple[str, ...]:

@@ -298,7 +298,8 @@ def main():
                 out.write(json.dumps(line, default=float) + "\n")
             hidden = ", ".join(f"{h['effect']} {h['size']}" for h in line.get("hidden", []))
             named = [n if isinstance(n, list) else [n["effect"], n["axis"]] for n in line["named"]]
-            mark = "" if line.get("first", True) else "  tie" if line["tie"] else "  WRONG"
+            missed = kind in ("one", "size") and not line["first"]
+            mark = "" if not missed else "  tie" if line["tie"] else "  WRONG"
             print(
                 f"{time.perf_counter() - begun:6.0f} s  {kind} {line['seed']}: {hidden or '-'} -> "
                 f"{named} {line.get('verdict', '')} {line['seconds']} s{mark}",

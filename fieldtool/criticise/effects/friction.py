@@ -16,6 +16,8 @@ from fieldtool.criticise.simulate.structure import Element, Law, Structure
 
 TURNS = ((1e-5, 1e-3), (1e-5, 0.03), (1e-3, 1e-3), (1e-2, 1e-3))
 """Start values: presliding distance over the travel, rounding velocity over the fastest."""
+OF_ITS_OWN = 0.1
+"""Of friction, that has to fall with the speed or differ between the directions to be called so."""
 SLOWEST = (0.05, 0.15, 0.4)
 """Shares of the fastest velocity, as start values of the Stribeck velocity."""
 
@@ -82,6 +84,12 @@ class StribeckFriction(Effect):
         position = np.ascontiguousarray(motion.smooth_position[:, self.axis])
         return np.asarray(slider(position, limit, limit, values["presliding"]))
 
+    def implausible(self, values: Values, context: Context) -> str:
+        """Refuse what is the same at all speeds: then it is dry friction, whatever its form."""
+        if values["extra"] < OF_ITS_OWN * values["torque"]:
+            return "it would be nearly the same at all speeds"
+        return ""
+
     def plain(self, values: Values) -> dict[str, tuple[float, str, tuple[str, ...]]]:
         """Breakaway as a whole, as it is usually stated."""
         out = super().plain(values)
@@ -114,6 +122,18 @@ class AsymmetricFriction(Effect):
         moving = motion.velocity[:, self.axis]
         wet = np.where(velocity > 0, values["viscous_positive"], values["viscous_negative"])
         return np.asarray(dry + wet * moving, dtype=np.float64)
+
+    def implausible(self, values: Values, context: Context) -> str:
+        """Refuse what is the same in both directions: then it is dry friction."""
+        forward, backward = (
+            values[f"coulomb_{way}"] + values[f"viscous_{way}"] * speed
+            for way in ("positive", "negative")
+            for speed in (context.fastest(self.axis),)
+        )
+        dry = values["coulomb_positive"], values["coulomb_negative"]
+        apart = max(abs(dry[0] - dry[1]) / max(*dry, 1e-300),
+                    abs(forward - backward) / max(abs(forward), abs(backward), 1e-300))  # fmt: skip
+        return "it would be nearly the same in both directions" if apart < OF_ITS_OWN else ""
 
 
 def friction_candidates(context: Context) -> list[Effect]:

@@ -3,9 +3,11 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from fieldtool.criticise.effects.base import Effect
 from fieldtool.criticise.effects.friction import friction_candidates
-from fieldtool.criticise.search.fit import Fitted, fit, strain
+from fieldtool.criticise.search.fit import Fitted, fit
 from fieldtool.criticise.search.hypothesis import Hypothesis
 from fieldtool.criticise.search.judge import (
     axis_power,
@@ -14,14 +16,15 @@ from fieldtool.criticise.search.judge import (
     moved,
     relative_errors,
 )
+from fieldtool.criticise.search.machine import Variable
 from fieldtool.criticise.search.prepare import Prepared
 from fieldtool.criticise.search.rules import (
-    ALIKE_SHARE,
     ALIKE_T,
     LEAST_TORQUE,
     LESS_MOVED,
     STAYED,
     Tried,
+    tolerance,
 )
 from fieldtool.criticise.search.significance import compared
 from fieldtool.criticise.where.sentences import relative_noise
@@ -118,17 +121,21 @@ def unsigned(prepared: Prepared, hypothesis: Hypothesis, effect: Effect) -> str:
 
 
 def tied(
-    prepared: Prepared, current: Fitted, accepted: Sequence[Accepted]
+    prepared: Prepared,
+    current: Fitted,
+    accepted: Sequence[Accepted],
+    without: frozenset[str] = frozenset(),
 ) -> tuple[Fitted, list[Accepted]]:
     """Put each rival in its cause's place, all else fitted beside; what does as well is a tie.
 
     Of a delay and what mimics it the delay is named first; else what does best.
     """
-    current, accepted = with_directions(prepared, current, accepted)
+    if "asymmetric_friction" not in without:
+        current, accepted = with_directions(prepared, current, accepted)
     out: list[Accepted] = []
     named = {a.tried.effect.key for a in accepted}
     for a in accepted:
-        first, ties = a.tried, [t for t in a.ties if t.effect.name in DIRECTIONS]
+        first, ties = a.tried, [t for t in a.ties if _of_directions(a.tried, t)]
         for rival in a.ties:
             if rival.effect.key in named or rival in ties:
                 continue
@@ -140,7 +147,7 @@ def tied(
                 swapped = replace(swapped, base=rival.fitted.hypothesis.base)
             fitted = fit(prepared.simulator, swapped)
             worse = difference(prepared.simulator, fitted, current)
-            enough = ALIKE_SHARE * max(first.gain.before - first.gain.after, 0.0)
+            enough = tolerance(first.gain)
             if worse.t >= ALIKE_T and worse.before - worse.after > enough:
                 continue
             delayed = (
@@ -158,6 +165,12 @@ def tied(
     return current, out
 
 
+def _of_directions(one: Tried, other: Tried) -> bool:
+    """Whether two are friction on a false zero, and friction that differs between the directions."""
+    names = {one.effect.name, other.effect.name}
+    return names == set(DIRECTIONS) and one.effect.axis == other.effect.axis
+
+
 def _preferred(prepared: Prepared, rival: Fitted, first: Fitted, enough: float) -> bool:
     """Whether a rival stands before the first: clearly better, or as good and the machine as it was."""
     there, here = (moved(f, prepared.accepted) for f in (rival, first))
@@ -173,7 +186,6 @@ def with_directions(
     """Add friction that differs between the directions, as a rival of dry friction on a false zero.
 
     Friction F+ forward and F- backward is dry friction of (F+ + F-) / 2 and a constant (F+ - F-) / 2.
-    Where the zero of the torque would have to be further off than is likely, the directions differ.
     """
     out: list[Accepted] = []
     for a in accepted:
@@ -207,16 +219,31 @@ def with_directions(
         base[machine.names.index(name)] = 0.0
         swapped = replace(swapped, base=base, values=(*swapped.values[:-1], start))
         fitted = fit(prepared.simulator, swapped)
-        if difference(prepared.simulator, fitted, current).t >= ALIKE_T:
+        worse = difference(prepared.simulator, fitted, current)
+        lost = worse.t >= ALIKE_T and worse.before - worse.after > tolerance(a.tried.gain)
+        if lost or rival.implausible(
+            fitted.hypothesis.values[-1], prepared.context(fitted.hypothesis)
+        ):
             out.append(a)
             continue
         other = replace(a.tried, effect=rival, fitted=fitted)
-        if strain(current) > strain(fitted) + ALIKE_T**2:
+        if _rather_directions(off, machine.variables[machine.names.index(name)], values["torque"]):
             out.append(Accepted(other, (replace(a.tried, fitted=current), *a.ties)))
             current = fitted
         else:
             out.append(Accepted(a.tried, (other, *a.ties)))
     return current, out
+
+
+def _rather_directions(off: float, zero: Variable, friction: float) -> bool:
+    """Whether a constant torque is more likely of friction's directions than of a false zero.
+
+    A false zero is normal with the standard error that zeros have; what directions make of it is
+    anything up to the friction itself.  Both densities are compared.
+    """
+    known = zero.scale * zero.known
+    odds = np.log(max(2.0 * friction / (known * np.sqrt(2.0 * np.pi)), 1e-300))
+    return abs(off) > known and 0.5 * (off / known) ** 2 > odds
 
 
 def convincing(

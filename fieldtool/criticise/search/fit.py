@@ -47,6 +47,13 @@ class Fitted:
             if name.startswith(lead)
         }
 
+    def error_of(self, place: int, weights: Mapping[str, float]) -> float:
+        """Return the standard error of a weighted sum of numbers of one effect."""
+        name = self.hypothesis.effects[place].name
+        at = [self.names.index(f"{place}:{name}.{parameter}") for parameter in weights]
+        w = np.array(list(weights.values()))
+        return float(np.sqrt(max(w @ self.covariance[np.ix_(at, at)] @ w, 0.0)))
+
 
 @dataclass(frozen=True)
 class _Free:

@@ -26,6 +26,8 @@ ALIKE_T = 2.0
 """Rivals whose difference on unseen data is below this many standard errors are a tie."""
 ALIKE_SHARE = 0.025
 """Of what is explained: forms of effects are not so sure that less would tell rivals apart."""
+ALIKE_LEFT = 0.5
+"""Of what the better of two rivals leaves: who leaves so much more is no rival, however little it is."""
 STAYED, LESS_MOVED = 1e-3, 4.0
 """Sum of squares of the machine's relative changes that says nothing; ratio of two that does."""
 FAMILIES = (
@@ -63,9 +65,23 @@ STRENGTH = {
 """The numbers of which at least one has to be known well."""
 
 
+CONTRASTS = {
+    "asymmetric_friction": (
+        ("coulomb_positive", "coulomb_negative"), ("viscous_positive", "viscous_negative"),
+    ),
+}  # fmt: skip
+"""Pairs of numbers of which at least one has to differ for sure."""
+
+
 def related(one: str, other: str) -> bool:
     """Whether two effects are of one family, so that the form of one may look like the other."""
     return one == other or any({one, other} <= family for family in FAMILIES)
+
+
+def tolerance(gain: Comparison) -> float:
+    """Return by how much more a rival may leave than a cause of this gain, and be as good."""
+    explained = max(gain.before - gain.after, 0.0)
+    return min(ALIKE_SHARE * explained, ALIKE_LEFT * gain.after)
 
 
 @dataclass(frozen=True)
@@ -105,7 +121,7 @@ def why_not(tried: Tried, context: Context, known_noise: bool, level: float, fur
     """
     if tried.gain.p > CHANCE:
         return "explains no more of the unseen data than chance would"
-    if tried.beyond < BEYOND_NOISE:
+    if tried.beyond < BEYOND_NOISE and tried.effect.name != "periodic_disturbance":
         return "there is nothing beyond the noise that it could explain"
     least = LEAST_SHARE
     if known_noise:
@@ -136,4 +152,10 @@ def _unphysical(tried: Tried, context: Context) -> str:
         errors = [numbers[n][1] / max(abs(numbers[n][0] - reference), 1e-300) for n in strong]
         if not min(errors) <= KNOWN_WELL:
             return f"its {strong[0]} can not be told from none"
+    alike = [
+        (values[a] - values[b], tried.fitted.error_of(tried.place, {a: 1.0, b: -1.0}))
+        for a, b in CONTRASTS.get(effect.name, ())
+    ]
+    if alike and all(error > KNOWN_WELL * abs(apart) for apart, error in alike):
+        return "its directions can not be told from one another"
     return effect.implausible(values, context)

@@ -7,7 +7,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from fieldtool.criticise.effects import candidates
+from fieldtool.criticise.effects import candidates, disturbance_candidates
 from fieldtool.criticise.effects.base import Context, Effect
 from fieldtool.criticise.search.afterwards import (
     Accepted,
@@ -24,7 +24,6 @@ from fieldtool.criticise.search.hypothesis import Hypothesis, Simulator
 from fieldtool.criticise.search.judge import Parts, beyond_noise, difference, judged, moved
 from fieldtool.criticise.search.prepare import Prepared, reweighted
 from fieldtool.criticise.search.rules import (
-    ALIKE_SHARE,
     ALIKE_T,
     BEYOND_NOISE,
     CHANCE,
@@ -33,6 +32,7 @@ from fieldtool.criticise.search.rules import (
     STAYED,
     Tried,
     related,
+    tolerance,
     why_not,
 )
 from fieldtool.criticise.search.screen import Screened, Tangent, screened, tangent
@@ -117,7 +117,7 @@ def search(
         current = fit(prepared.simulator, current.hypothesis)
     advance("check the causes against each other", 0.9)
     current, accepted = pruned(prepared, current, accepted, rejected)
-    current, accepted = tied(prepared, current, accepted)
+    current, accepted = tied(prepared, current, accepted, without)
     before = fit(prepared.simulator, before.hypothesis)
     current, accepted = unharmful(prepared, before, current, accepted, rejected)
     current, accepted = convincing(prepared, before, current, accepted, rejected)
@@ -186,9 +186,11 @@ def _round(
         for axis in range(len(prepared.recording.axes))
         if beyond_noise(everything, [axis]) >= BEYOND_NOISE
     }
-    if not active:
-        return [], []
     context = prepared.context(current.hypothesis)
+    # A single line is little beside the noise of all lines, and yet stands out of those around it.
+    lines = "periodic_disturbance" not in without and disturbance_candidates(context)
+    if not active and not lines:
+        return [], []
     what = f"look for cause {len(accepted) + 1}"
 
     def step(share: float) -> None:
@@ -199,7 +201,7 @@ def _round(
     chosen: list[Screened] = []
     for number, start in enumerate(starts):
         pool = candidates(prepared.context(start), without)
-        pool = [e for e in pool if {e.axis, e.other} & active]
+        pool = [e for e in pool if {e.axis, e.other} & active or e.name == "periodic_disturbance"]
         at = tangent(simulator, start)
         ranked = screened(simulator, at, pool, _part(step, number, len(starts)))
         chosen = _chosen(ranked, at)
@@ -292,7 +294,7 @@ def _winner(prepared: Prepared, tried: Sequence[Tried], rejected: Reasons) -> Ac
         if (
             other.effect.name == "measurement_delay"
             and other.effect.axis == best.effect.axis
-            and (alike or lost < ALIKE_SHARE * (best.gain.before - best.gain.after))
+            and (alike or lost < tolerance(best.gain))
         ):
             best = other
         elif contained and (
@@ -316,7 +318,7 @@ def _least_moved(prepared: Prepared, tried: Sequence[Tried], best: Tried) -> Tri
             continue
         lost = other.gain.after - first.gain.after
         alike = (
-            lost < ALIKE_SHARE * (first.gain.before - first.gain.after)
+            lost < tolerance(first.gain)
             or difference(prepared.simulator, other.fitted, first.fitted).t < ALIKE_T
         )
         there = moved(best.fitted, prepared.accepted)

@@ -144,7 +144,7 @@ class Driven:
 
     @cached_property
     def substeps(self) -> int:
-        """Sub-steps that resolve the fastest swing: what only decays is exact, and follows the masses."""
+        """Sub-steps that resolve the fastest swing; what only decays is exact, follows the masses."""
         rates = np.linalg.eigvals(self.system.rates)
         fastest = float(np.abs(rates[rates.imag != 0.0]).max(initial=0.0))
         return int(np.clip(np.ceil(fastest * self.step / LARGEST_TURN), 1, MOST_SUBSTEPS))

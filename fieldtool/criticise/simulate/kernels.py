@@ -128,7 +128,7 @@ def pull(
 
     ``t`` is when the sample began, ``elapsed`` the time since, ``span`` that to the next sample.
     """
-    p0, p1, p2 = values[0], values[1], values[2]
+    p0, p1, p2 = float(values[0]), float(values[1]), float(values[2])
     if law == CUBIC:
         return p0 * s * s * s
     if law == GAP:
@@ -139,9 +139,7 @@ def pull(
         return -p0 * s - p1 * rate
     if law == STEP:
         return p0 * s if t + elapsed * span >= p1 else 0.0
-    if law == DRY:
-        return p0 * np.tanh(rate / p1)
-    return 0.0
+    return p0 * float(np.tanh(rate / p1))
 
 
 @njit(cache=True, fastmath=True)  # type: ignore[untyped-decorator]

@@ -87,7 +87,7 @@ class Structure:
         return numbers + repr((self.elements, self.branches)).encode()
 
     def between(self, begin: float, end: float) -> "Structure":
-        """Return the structure as it is from one time to another: steps outside of it are no elements."""
+        """Return the structure as it is from one time to another: other steps are no elements."""
         left, stiffness = [], self.stiffness
         for e in self.elements:
             if e.law is not Law.STEP or begin < e.values[1] <= end:
