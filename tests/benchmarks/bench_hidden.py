@@ -12,8 +12,8 @@ alone, from the machine as it was accepted before.
 - ``size``: one effect, sizes from half the noise floor up.
 - ``time``: two axes, six recordings of 20 s at 1 kHz, the whole library.
 
-Every case is one line of JSON in FILE, with its seed: runs add up, and a table of all of them is printed
-at the end.  Without arguments, a few of each into a file that is thrown away.
+Every case is one line of JSON in FILE, with its seed: a run goes on where FILE ends, until it holds as many
+cases as are asked for, and a table of all of them is printed at the end.  Without arguments, a few of each into a file that is thrown away.
 
 ``keep=DIRECTORY`` keeps what was drawn and recorded, so that other code can be tried on the same cases.
 
@@ -291,8 +291,8 @@ def main():
     begun = time.perf_counter()
     for kind, count in todo.items():
         already = sum(x["kind"] == kind for x in have)
-        for k in range(count):
-            line = case_of(kind, already + k, seed + 7919 * (already + k), effect, kept(keep))
+        for number in range(already, count):
+            line = case_of(kind, number, seed + 7919 * number, effect, kept(keep))
             have.append(line)
             with file.open("a") as out:
                 out.write(json.dumps(line, default=float) + "\n")

@@ -12,6 +12,7 @@ from fieldtool.criticise.search.hypothesis import Hypothesis
 from fieldtool.criticise.search.judge import (
     axis_power,
     difference,
+    explained_share,
     explained_torque,
     moved,
     relative_errors,
@@ -32,6 +33,8 @@ from fieldtool.criticise.where.views import views_of
 
 SHOWN = 0.3
 """Share of what an effect explains, that the view which it must show has to explain."""
+NEARLY_ALL = 0.95
+"""Share of what is left on unseen data, from which an effect is its own signature."""
 FEW_STEPS = 6
 MOST_OF_IT = 0.5
 """Share of what is wrong of an axis, noise taken off, that its causes explain together at least."""
@@ -78,12 +81,15 @@ def pruned(
             why = "" if gain.t >= ALIKE_T else "is not missed once the others are there"
             if torque < LEAST_TORQUE:
                 why = "lowers no error on unseen data once the others are there"
-            judged.append((replace(a, tried=replace(a.tried, gain=gain, torque=torque)), less, why))
+            share = explained_share(before, parts, _axes_of(effect))
+            beside = replace(a.tried, gain=gain, torque=torque, share=share)
+            judged.append((replace(a, tried=beside), less, why))
         worst = min(judged, key=lambda j: j[0].tried.gain.t)
         reason = worst[2]
         if not reason:
             for one in judged:
-                reason = unsigned(prepared, current.hypothesis, one[0].tried.effect)
+                tried = one[0].tried
+                reason = unsigned(prepared, current.hypothesis, tried.effect, tried.share)
                 if reason:
                     worst = one
                     break
@@ -96,9 +102,17 @@ def pruned(
     return current, kept
 
 
-def unsigned(prepared: Prepared, hypothesis: Hypothesis, effect: Effect) -> str:
-    """Say so where the error without an effect does not look as the effect must; else empty."""
-    if not effect.seen_by:
+def _axes_of(effect: Effect) -> list[int]:
+    return [effect.axis] if effect.other is None else [effect.axis, effect.other]
+
+
+def unsigned(prepared: Prepared, hypothesis: Hypothesis, effect: Effect, share: float) -> str:
+    """Say so where the error without an effect does not look as the effect must; else empty.
+
+    What explains nearly all that was left on unseen data, ``share`` of it, needs no other sign: views
+    are smooth in frequency, and a delay of an elastic axis is not.
+    """
+    if not effect.seen_by or share >= NEARLY_ALL:
         return ""
     place = place_of(hypothesis, effect)
     less = replace(

@@ -145,7 +145,7 @@ def fit(
     old = None
     if shared is not None:
         old = shared[:, [f.index for f in free if f.parameter is None]]
-    for turn in range(steps):
+    for turn in range(steps if np.isfinite(cost) else 0):
         fresh = old is None
         jacobian = derivatives(simulator, current, free, r, old)
         old = jacobian[:, machine]
@@ -234,7 +234,9 @@ def derivatives(
         moved = vector.copy()
         moved[k] += step
         tried = with_vector(hypothesis, free, moved)
-        columns.append((simulator.residual(tried, "fit") - r) / (step / f.scale))
+        change = (simulator.residual(tried, "fit") - r) / (step / f.scale)
+        # Where a machine beside the one at hand runs away, no step is taken towards it.
+        columns.append(change if np.all(np.isfinite(change)) else np.zeros_like(change))
     return np.column_stack(columns)
 
 

@@ -22,18 +22,22 @@ def judged(simulator: Simulator, fitted: Fitted, effect: Effect, before: Parts) 
     """Measure what a fitted hypothesis with an effect gains over what was before, on unseen data."""
     after = simulator.parts(fitted.hypothesis, "unseen")
     axes = [effect.axis] if effect.other is None else [effect.axis, effect.other]
-    there = sum(axis_power(before, axis) for axis in axes)
-    gained = there - sum(axis_power(after, axis) for axis in axes)
-    noise = sum(expected_noise(before, axis) for axis in axes)
-    share = gained / max(there - noise, UNSURE_NOISE * there, 1e-300)
     return Tried(
         fitted,
         effect,
         compared(before, after),
-        share,
+        explained_share(before, after, axes),
         explained_torque(before, after, effect.axis),
         beyond_noise(before, axes),
     )
+
+
+def explained_share(before: Parts, after: Parts, axes: Sequence[int]) -> float:
+    """Return the share of the power of some axes' errors, noise taken off, that is explained."""
+    there = sum(axis_power(before, axis) for axis in axes)
+    gained = there - sum(axis_power(after, axis) for axis in axes)
+    noise = sum(expected_noise(before, axis) for axis in axes)
+    return gained / max(there - noise, UNSURE_NOISE * there, 1e-300)
 
 
 def difference(simulator: Simulator, worse: Fitted, better: Fitted) -> Comparison:

@@ -7,8 +7,9 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from fieldtool.criticise.effects import candidates, disturbance_candidates
+from fieldtool.criticise.effects import candidates
 from fieldtool.criticise.effects.base import Context, Effect
+from fieldtool.criticise.effects.torque import disturbance_candidates
 from fieldtool.criticise.search.afterwards import (
     Accepted,
     Reasons,
@@ -210,6 +211,9 @@ def _round(
             step((number + SCREENING + (1 - SCREENING) * k / len(chosen)) / len(starts))
             fitted = fit(simulator, _grown(start, one), shared=at.of_machine)
             key = one.effect.key
+            if not np.isfinite(fitted.cost):
+                rejected[key] = (one.effect, "the simulated machine runs away with it")
+                continue
             if key not in best or fitted.cost < best[key].fitted.cost:
                 best[key] = judged(simulator, fitted, fitted.hypothesis.effects[-1], unseen)
         if any(t.share >= CLEAR and t.gain.p <= CHANCE for t in best.values()):
@@ -223,7 +227,7 @@ def _round(
             good.append(candidate)
     signed = []
     for candidate in good:
-        why = unsigned(prepared, candidate.fitted.hypothesis, candidate.effect)
+        why = unsigned(prepared, candidate.fitted.hypothesis, candidate.effect, candidate.share)
         rejected[candidate.effect.key] = (candidate.effect, why)
         if not why:
             signed.append(candidate)
@@ -344,6 +348,8 @@ def _pair(
             continue
         grown = _grown(_grown(current.hypothesis, one), other)
         fitted = fit(simulator, grown, shared=at.of_machine)
+        if not np.isfinite(fitted.cost):
+            continue
         both = [judged(simulator, fitted, e, unseen) for e in fitted.hypothesis.effects[-2:]]
         if any(_why_not(prepared, context, accepted, t) for t in both):
             continue
