@@ -12,8 +12,9 @@ alone, from the machine as it was accepted before.
 - ``size``: one effect, sizes from half the noise floor up.
 - ``time``: two axes, six recordings of 20 s at 1 kHz, the whole library.
 
-Every case is one line of JSON in FILE, with its seed: a run goes on where FILE ends, until it holds as many
-cases as are asked for, and a table of all of them is printed at the end.  Without arguments, a few of each into a file that is thrown away.
+Every case is one line of JSON in FILE, with its seed: a run goes on where FILE ends, until it holds as
+many cases as are asked for, and a table of all of them is printed at the end.  Without arguments, a few
+of each into a file that is thrown away.
 
 ``keep=DIRECTORY`` keeps what was drawn and recorded, so that other code can be tried on the same cases.
 

@@ -11,6 +11,7 @@ from math import isfinite, pi
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import least_squares
 
 from drives.sim.effects import ChainEffect, MachineEffect
 from drives.sim.plant import Plant
@@ -121,8 +122,19 @@ def _hardening(part: Part, case: Case, hidden: Hidden) -> dict[str, float]:
 
 
 def _softening(part: Part, case: Case, hidden: Hidden) -> dict[str, float]:
+    """The softening of the library's law that is nearest to the plant's over the twists in use."""
     k, a = _spring(case, hidden), part.stretch  # type: ignore[union-attr]
-    return {"cubic": _cubic(lambda s: k * a * np.tanh(s / a), case, hidden)}
+    twist = twist_in_use(case, hidden.axis, part.joint)  # type: ignore[union-attr]
+    nodes, weights = np.polynomial.hermite_e.hermegauss(24)
+    s = twist * nodes
+
+    def off(numbers: FloatArray) -> FloatArray:
+        stiffness, cubic = k * numbers[0], -k / (3 * a**2) * numbers[1]
+        law = stiffness * s / np.sqrt(1 - 2 * cubic * s**2 / stiffness)
+        return np.asarray(np.sqrt(weights) * (law - k * a * np.tanh(s / a)) / (k * twist))
+
+    found = least_squares(off, [1.0, 1.0], bounds=([0.2, 1e-3], [5.0, 100.0])).x
+    return {"cubic": float(-k / (3 * a**2) * found[1])}
 
 
 Truth = Callable[..., Mapping[str, float]]

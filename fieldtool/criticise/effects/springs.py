@@ -36,16 +36,7 @@ class SpringEffect(Effect):
         return -float(structure.stiffness[a, b]), -float(structure.damping[a, b])
 
 
-class CubicSpring(SpringEffect):
-    """A spring whose stiffness grows or falls with the square of its elongation."""
-
-    def structure(self, structure: Structure, values: Values) -> Structure:
-        """Add the cubic part."""
-        a, b = self.ends_of(structure)
-        return structure.with_elements(Element(Law.CUBIC, a, b, (values["cubic"], 0.0, 0.0)))
-
-
-class HardeningSpring(CubicSpring):
+class HardeningSpring(SpringEffect):
     """Stiffer when it is stretched further."""
 
     name = "hardening_spring"
@@ -54,15 +45,28 @@ class HardeningSpring(CubicSpring):
     signature = "resonances that rise with the amplitude; odd harmonics that grow with its cube"
     contrary = "even harmonics; a torque that follows the sign of the velocity"
 
+    def structure(self, structure: Structure, values: Values) -> Structure:
+        """Add the cubic part."""
+        a, b = self.ends_of(structure)
+        return structure.with_elements(Element(Law.CUBIC, a, b, (values["cubic"], 0.0, 0.0)))
 
-class SofteningSpring(CubicSpring):
-    """Softer when it is stretched further."""
+
+class SofteningSpring(SpringEffect):
+    """Softer when it is stretched further, and never pushing away: a cubic alone runs away."""
 
     name = "softening_spring"
-    equation = "tau = k s + cubic s^3, cubic < 0"
-    source = "Duffing 1918; Nayfeh and Mook, Nonlinear Oscillations, 1979"
+    equation = (
+        "tau = k s / sqrt(1 - 2 cubic s^2 / k), cubic < 0: k s + cubic s^3 at small elongations"
+    )
+    source = "Nayfeh and Mook, Nonlinear Oscillations, 1979 (to the third order)"
     signature = "resonances that fall with the amplitude; odd harmonics that grow with its cube"
     contrary = "even harmonics; a torque that follows the sign of the velocity"
+
+    def structure(self, structure: Structure, values: Values) -> Structure:
+        """Take off what the spring lacks."""
+        a, b = self.ends_of(structure)
+        k, _ = self.stiffness_of(structure)
+        return structure.with_elements(Element(Law.SOFT, a, b, (values["cubic"], k, 0.0)))
 
 
 class Backlash(SpringEffect):

@@ -86,8 +86,14 @@ class TorqueSaturation(Effect):
     """A torque that stays at a limit while the drive reports more."""
 
     name = "torque_saturation"
-    equation = "true = max(-limit, min(limit, reported))"
-    source = "current or voltage limit of the drive; Hippe, Windup in Control, 2006"
+    equation = (
+        "abs(true) = min(abs(reported), limit), its corner rounded: "
+        "limit - rounding ln(1 + exp((limit - abs(reported)) / rounding))"
+    )
+    source = (
+        "limit of the drive: Hippe, Windup in Control, 2006; iron that saturates bends before: "
+        "Krause, Analysis of Electric Machinery, 2002"
+    )
     signature = "an error only where the reported torque is large, of its sign; odd harmonics"
     contrary = "an error at small torques"
     shows = ("large torque",)
@@ -95,8 +101,11 @@ class TorqueSaturation(Effect):
     def reported(self, torque: FloatArray, motion: Motion, values: Values) -> FloatArray:
         """Add what the drive reported beyond the limit."""
         asked = motion.torque[:, self.axis]
-        limit = values["limit"]
-        return torque + asked - np.clip(asked, -limit, limit)
+        size, width = np.abs(asked), values["rounding"]
+        given = values["limit"] - width * np.logaddexp(0.0, (values["limit"] - size) / width)
+        # At rest nothing is given: what the rounded corner lacks there is the same everywhere.
+        none = values["limit"] - width * np.logaddexp(0.0, values["limit"] / width)
+        return np.asarray(torque + np.sign(asked) * (size - given + none))
 
 
 class PeriodicDisturbance(Effect):
@@ -138,6 +147,14 @@ def torque_candidates(context: Context) -> list[Effect]:
                         share * largest,
                         0.3 * largest,
                         1.05 * largest,
+                        0.02 * largest,
+                    ),
+                    Parameter(
+                        "rounding",
+                        context.torque_unit(axis),
+                        0.03 * largest,
+                        1e-3 * largest,
+                        0.3 * largest,
                         0.02 * largest,
                     ),
                 ),

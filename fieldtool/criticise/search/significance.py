@@ -74,9 +74,13 @@ def compared(before: Parts, after: Parts) -> Comparison:
         size = np.array([part.sum() for part in np.array_split(both, count)])
         gains.append(np.array([part.sum() for part in np.array_split(difference, count)]))
         shares.append(gains[-1] / np.maximum(size, 1e-300))
+    count = sum(g.size for g in gains)
+    if not np.isfinite(sums[1]):  # it runs away
+        return Comparison(sums[0], float("inf"), float("-inf"), 1.0, count)
+    if not np.isfinite(sums[0]):
+        return Comparison(float("inf"), sums[1], float("inf"), 0.0, count)
     t, p = chance(*gains)
     t_relative, p_relative = chance(*shares)
-    count = sum(g.size for g in gains)
     if sums[1] >= sums[0]:
         return Comparison(sums[0], sums[1], min(t, 0.0), 1.0, count)
     chances = min(1.0, 2 * min(p, p_relative))

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-CUBIC, GAP, STEP, DRY = 1, 2, 3, 4
+CUBIC, GAP, STEP, DRY, SOFT = 1, 2, 3, 4, 5
 """As :class:`fieldtool.criticise.simulate.structure.Law`."""
 
 
@@ -120,7 +120,7 @@ def both_ways(sections: FloatArray, at_rest: FloatArray, values: FloatArray) -> 
     return out[more : more + n]
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def pull(
     law: int, values: FloatArray, s: float, rate: float, t: float, span: float, elapsed: float
 ) -> float:
@@ -139,10 +139,12 @@ def pull(
         return -p0 * s - p1 * rate
     if law == STEP:
         return p0 * s if t + elapsed * span >= p1 else 0.0
+    if law == SOFT:
+        return p1 * s * (1.0 / float(np.sqrt(1.0 - 2.0 * p0 * s * s / p1)) - 1.0)
     return p0 * float(np.tanh(rate / p1))
 
 
-@njit(cache=True, fastmath=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def march_bent(
     step: FloatArray,
     of_start: FloatArray,

@@ -27,6 +27,8 @@ class Law(IntEnum):
     """p0 s from the time p1 on."""
     DRY = 4
     """p0 tanh(s' / p1)."""
+    SOFT = 5
+    """Makes of the spring p1 one of p1 s / sqrt(1 - 2 p0 s**2 / p1), p0 < 0: + p0 s**3 at first."""
 
 
 @dataclass(frozen=True)
