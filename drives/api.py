@@ -138,8 +138,26 @@ class MotionWatch(Protocol):
     def trusts_loops(self) -> bool:
         """Whether a quick stop may be left to the drives' loops; else a safety stop cuts all power."""
 
-    def take(self, position: Sequence[float], torque: Sequence[float]) -> Alarm | None:
-        """Take the sample of one SYNC, M values each, SI; return why the motion has to end, or None."""
+    def take(
+        self,
+        position: Sequence[float],
+        torque: Sequence[float],
+        target: Sequence[float],
+        offset: Sequence[float],
+        *,
+        fresh: bool,
+    ) -> Alarm | None:
+        """Take the sample of one SYNC; return why the motion has to end, or None.
+
+        Parameters
+        ----------
+        position, torque
+            As the drives sampled them at the SYNC, M values each, SI.
+        target, offset
+            Position targets and torque offsets that took effect at it, as sent, M values each, SI.
+        fresh
+            Whether the SYNC was in time and every drive answered it; else a sample may be an old one.
+        """
 
 
 class Onlooker(Protocol):

@@ -74,7 +74,7 @@ class CanopenMotion:
         self._by_cob = {0x180 + c.drive.node_id: k for k, c in enumerate(self._channels)}
         self._by_node = {c.drive.node_id: c for c in self._channels}
         self._sync: Sync = sync or HostSync(line, cycle_time)
-        self._disturbed = False
+        self._disturbed, self._complete = False, True
         self._moment = line.clock.now()
         self._lost = line.overruns
         self._lost_before = self._lost
@@ -213,7 +213,7 @@ class CanopenMotion:
             self._check_user()
             self._check_strangers()
             if any(c.state is PowerState.OPERATION_ENABLED for c in self._channels):
-                self._look()
+                self._look(self._held_targets(), [0] * len(self._channels))
             for channel in self._channels:
                 self._check_enabling(channel)
             if all(c.state is PowerState.OPERATION_ENABLED for c in self._channels):
@@ -440,7 +440,7 @@ class CanopenMotion:
                     raw.extend(channel.last)
                 if not complete:
                     missing.append(row)
-                self._check(units[row])
+                self._check(units[row].tolist(), outputs.offset_units[row].tolist())
         finally:
             for k, channel in enumerate(self._channels):
                 channel.hold = int(units[row, k])  # what was sent last stays the target
@@ -455,8 +455,11 @@ class CanopenMotion:
             self._cycle([self._word(c, Controlword.ENABLE_OPERATION) for c in channels])
             for channel in channels:
                 channel.offset = 0
-            held = [c.position if c.hold is None else c.hold for c in channels]
-            self._check(np.array(held, dtype=np.int32))
+            self._check(self._held_targets(), [0] * len(channels))
+
+    def _held_targets(self) -> list[int]:
+        """Return where every axis is told to stand, position units."""
+        return [c.position if c.hold is None else c.hold for c in self._channels]
 
     def _capture(
         self, first: int, outputs: Outputs, received: list[bytearray], missing: list[int]
@@ -492,7 +495,8 @@ class CanopenMotion:
             channel.strayed = False
         complete = self._collect(moment + REPLY_SHARE * self._cycle_time)
         spoiled = self._disturbed or self._sync.lateness > 0 or self._lost_frames()
-        return complete and not spoiled
+        self._complete = complete and not spoiled
+        return self._complete
 
     def _note_pause(self, moment: float) -> None:
         """Have velocities judged over the time that has passed, where a SYNC was late."""
@@ -585,14 +589,14 @@ class CanopenMotion:
                 cycle=self._count - 1,
             )
 
-    def _check(self, targets: np.ndarray[tuple[int], np.dtype[np.int32]]) -> None:
+    def _check(self, targets: Sequence[int], offsets: Sequence[int]) -> None:
         """Raise SafetyStopError for the first thing that is not as it has to be."""
         self._check_user()
         self._check_lateness()
         self._check_strangers()
-        self._look()
+        self._look(targets, offsets)
         now = self._line.clock.now()
-        for channel, target in zip(self._channels, targets.tolist(), strict=True):
+        for channel, target in zip(self._channels, targets, strict=True):
             if not channel.is_fine(target, now):
                 raise SafetyStopError(
                     channel.violation(target, self._cycle_time),
@@ -601,8 +605,11 @@ class CanopenMotion:
                     runaway=channel.is_stuck(target),
                 )
 
-    def _look(self) -> None:
-        """Have the watch look at this cycle; raise OscillationError if it says that this has to end."""
+    def _look(self, targets: Sequence[int], offsets: Sequence[int]) -> None:
+        """Have the watch look at this cycle; raise OscillationError if it says that this has to end.
+
+        Targets and torque offsets are those that were sent, in the drives' units.
+        """
         if self._watch is None:
             return
         scales = [c.drive.scaling for c in self._channels]
@@ -610,6 +617,9 @@ class CanopenMotion:
         alarm = self._watch.take(
             [one[1] * scale.position for one, scale in zip(inputs, scales, strict=True)],
             [one[2] * scale.torque for one, scale in zip(inputs, scales, strict=True)],
+            [one * scale.position for one, scale in zip(targets, scales, strict=True)],
+            [one * scale.torque for one, scale in zip(offsets, scales, strict=True)],
+            fresh=self._complete,
         )
         if alarm is not None:
             raise OscillationError(

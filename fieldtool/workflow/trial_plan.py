@@ -19,28 +19,16 @@ from fieldtool.experiment.verification.excitation import (
     expected_peaks,
     sensitivity_plan,
 )
-from fieldtool.experiment.verification.swings import Swings
-from fieldtool.experiment.verification.trial import Trial, TrialMove
+from fieldtool.experiment.verification.trial import Trial
 from fieldtool.records.closed_loop import AxisLoop
-from fieldtool.records.model import FloatArray
 from fieldtool.workflow.design_inputs import moves_of, timing_of
+from fieldtool.workflow.trial_loops import drive_loop, first_answer
+from fieldtool.workflow.trial_moves import MOST, free_move, takes_too_much, trial_move
 
-ROOM = 0.6
-"""Of the way to the end of the travel that a move may use: it may overshoot."""
-FEWEST_COUNTS, BAND_COUNTS = 100.0, 4.0
-"""Counts of the encoder that a move, and the band about its target, have at least."""
-KEPT = 0.85
-"""Of the limits of torque, velocity and following error that a move may take by prediction."""
 GENTLER, TIMES = 0.75, 12
 """What is left of a move's velocity and acceleration where it takes more, and how often."""
-SWELLS, BESIDE = 1.6, 0.15
-"""Times the predicted torque, and share of the limit besides, that a move may take; never more than
-MOST of the limit, and OTHERS of it on axes that are not moved."""
-MOST, OTHERS = 0.97, 0.95
 EXCITED = 3.0
 """Times what the excitation does by the model that it may do."""
-REST, LEAST_REST, MOST_REST = 2.0, 0.5, 6.0
-"""Times the predicted settling for which a move is watched after its end; at least, at most, s."""
 NOISE_SWINGS = 12.0
 """Times the RMS of the torque that an encoder's steps make: by so much it may swing, peak to peak."""
 ROUNDED_TARGETS = 3.5
@@ -52,13 +40,10 @@ STANDSTILL_TIME, STANDSTILL_TIMEOUT = 0.25, 120.0
 STANDSTILL_COUNTS, STANDSTILL_TRAVEL = 3.0, 2e-4
 """A disabled axis stands that moves by less than so many counts, or this share of its travel, in so many
 seconds, twice; waited for at most."""
-UNFORESEEN, OFF_TARGET = 2.0, 0.05
-"""Times what is predicted that an axis may swing and be off its target once its reference stands; and
-the share of the way by which it may be off besides."""
-FINE_SWING = 0.02
-"""Of the limit of torque, or of the band about the target: smaller swings are left out."""
-ACCELERATES = 0.6
-"""Share of the time to speed up below which a torque that turns back is not the move's own."""
+_UNASKED = (
+    "{}: one count of its encoder makes so much torque that its controller is not asked for a first "
+    "answer; it is watched from its first move on"
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,12 +151,12 @@ def plan_trial(
     old = tuple(servo_of(drive, (), cycle) for drive in group.drives)
     new = tuple(servo_of(drive, changes, cycle) for drive in group.drives)
     typical = moves_of(group.machine, setting.model)
-    moves = tuple(_free_move(*pair) for pair in zip(group.drives, typical, strict=True))
+    moves = tuple(free_move(*pair) for pair in zip(group.drives, typical, strict=True))
     for _ in range(TIMES):
         before, after = (predict(setting.model, servos, moves) for servos in (old, new))
         _check_stable(after, bound)
         _check_as_designed(after, stated, designed)
-        over = [_takes_too_much(setting, k, (before, after)) for k in range(len(moves))]
+        over = [takes_too_much(setting, k, (before, after)) for k in range(len(moves))]
         if not any(over):
             break
         moves = tuple(
@@ -195,8 +180,20 @@ def plan_trial(
         max(torque_steps(drive, servo, cycle) for servo in (old[k], new[k]))
         for k, drive in enumerate(group.drives)
     ]
+    answers = [
+        first_answer(
+            [drive_loop(drive, servo) for servo in (old[k], new[k])],
+            abs(drive.scaling.position),
+            float(limits[k]),
+            moves[k].distance,
+            cycle,
+        )
+        for k, drive in enumerate(group.drives)
+    ]
+    unasked = [d.axis for d, answer in zip(group.drives, answers, strict=True) if not answer.size]
+    notes = tuple(_UNASKED.format(axis) for axis in unasked)
     trial_moves = tuple(
-        _trial_move(move, k, cycle, limits, steps[k], (before, after))
+        trial_move(move, k, cycle, limits, steps[k], (before, after), answers[k])
         for k, move in enumerate(moves)
     )
     plan = TrialPlan(
@@ -207,50 +204,23 @@ def plan_trial(
         new,
         before,
         after,
-        (),
+        notes,
     )
     return _with_excitation(plan, group, setting, steps)
-
-
-def _free_move(drive: CanopenDrive, typical: TestMove) -> TestMove:
-    """Return an axis' typical move from where it stands, as far as there is room for it.
-
-    It goes its own way where that fits, else towards the farther end of the travel.
-
-    Raises
-    ------
-    PlanRefusedError
-        If there is no room.
-    """
-    limits = drive.limits
-    at = drive.read_position()
-    down, up = at - limits.travel[0], limits.travel[1] - at
-    room = {1.0: ROOM * up, -1.0: ROOM * down}
-    sign = float(np.sign(typical.distance))
-    if abs(typical.distance) > room[sign]:
-        sign = 1.0 if up >= down else -1.0
-    way = min(abs(typical.distance), room[sign])
-    counts = abs(drive.scaling.position)
-    if way < FEWEST_COUNTS * counts:
-        raise PlanRefusedError(
-            f"{drive.axis}: stands at {at:.4g} {drive.position_unit} and has no room to move. Nothing "
-            "was moved or written. Move it away from the end of its travel."
-        )
-    band = max(typical.settling_band * way / abs(typical.distance), BAND_COUNTS * counts)
-    return replace(typical, distance=sign * way, band=band)
 
 
 def _check_as_designed(
     after: Prediction, stated: Mapping[str, float], designed: Prediction | None
 ) -> None:
     """Refuse parameters that are not what their tuning says of them: changed, or of another model."""
+    promises = {} if designed is None else {a.axis: a.margins.bandwidth for a in designed.axes}
     for axis in after.axes:
         peak, said = axis.margins.sensitivity_peak, stated.get(axis.axis)
         wrong = ""
         if said is not None and not 1 / NOT_AS_SAID < peak / said < NOT_AS_SAID:
             wrong = f"the peak of sensitivity is {said:.3g}; now it would be {peak:.3g}"
-        elif said is not None and designed is not None:
-            bandwidth, promised = axis.margins.bandwidth, designed.of(axis.axis).margins.bandwidth
+        elif said is not None and 0 < (promised := promises.get(axis.axis, 0.0)) < np.inf:
+            bandwidth = axis.margins.bandwidth
             if not 1 / FASTER_THAN_SAID < bandwidth / promised < FASTER_THAN_SAID:
                 wrong = f"the bandwidth is {promised:.3g} Hz; now it would be {bandwidth:.3g} Hz"
         if wrong:
@@ -276,85 +246,7 @@ def _check_stable(after: Prediction, bound: float) -> None:
             )
 
 
-def _takes_too_much(setting: Setting, k: int, predictions: Sequence[Prediction]) -> bool:
-    limits = setting.limits[k]
-    for prediction in predictions:
-        one = prediction.axes[k]
-        if one.curves is None or one.move is None:
-            continue
-        speed = float(np.abs(np.gradient(one.curves.position, one.curves.time)).max())
-        if (
-            one.peak_torque > KEPT * limits.torque
-            or one.move.following_error > KEPT * limits.following_error
-            or speed > KEPT * limits.velocity
-        ):
-            return True
-    return False
-
-
-def _trial_move(
-    move: TestMove,
-    k: int,
-    cycle: float,
-    limits: FloatArray,
-    steps: float,
-    predictions: Sequence[Prediction],
-) -> TrialMove:
-    known = [one.axes[k] for one in predictions if one.axes[k].move is not None]
-    peak = max((one.peak_torque for one in known), default=0.0)
-    torque = OTHERS * limits
-    torque[k] = min(SWELLS * peak + BESIDE * limits[k] + steps / 2, MOST * limits[k])
-    settles = max(
-        (
-            one.move.settling_time
-            for one in known
-            if one.move is not None and np.isfinite(one.move.settling_time)
-        ),
-        default=MOST_REST,
-    )
-    rest = min(max(REST * settles, LEAST_REST, move.duration), MOST_REST)
-    rise, held, _ = move.parts
-    half = ACCELERATES * (2 * rise + held)
-    swings, astray = _coming_to_rest(move, k, limits[k], predictions)
-    reference = move.reference(cycle)
-    return TrialMove(k, reference, round(rest / cycle), torque, half, swings, astray)
-
-
-def _coming_to_rest(
-    move: TestMove, k: int, limit: float, predictions: Sequence[Prediction]
-) -> tuple[tuple[float, float] | None, float]:
-    """Return how far an axis may swing once its reference stands, and how far it may be off its target.
-
-    Every prediction counts UNFORESEEN times; None and infinite where there is none.
-    """
-    curves = [one.axes[k].curves for one in predictions]
-    after = [(c.torque, c.position, c.time >= move.duration) for c in curves if c is not None]
-    if len(after) < len(curves):
-        return None, np.inf
-    torque = max(_second_swing(t[rest], FINE_SWING * limit) for t, _, rest in after)
-    position = max(_second_swing(p[rest], FINE_SWING * move.settling_band) for _, p, rest in after)
-    sign = np.sign(move.distance)
-    off = max(
-        float(
-            max(
-                np.abs(p[rest] - move.distance).max(initial=0.0), (sign * (p - move.distance)).max()
-            )
-        )
-        for _, p, rest in after
-    )
-    astray = UNFORESEEN * off + OFF_TARGET * abs(move.distance)
-    return (UNFORESEEN * torque, UNFORESEEN * position), astray
-
-
-def _second_swing(signal: FloatArray, fine: float) -> float:
-    """Return the second largest swing from turn to turn: what an alarm after two of them would see."""
-    swings = Swings()
-    swings.restart(fine)
-    sizes = [swings.sizes[-1] for value in signal.tolist() if swings.take(value)]
-    return sorted([0.0, 0.0, *sizes])[-2]
-
-
-def _without_feed_forward(drive: CanopenDrive, servo: Servo) -> AxisLoop:
+def without_feed_forward(drive: CanopenDrive, servo: Servo) -> AxisLoop:
     """Return a drive's loop with that feed-forward off that can be switched off."""
     loop, switched = servo.loop, drive.profile.feed_forward
     return replace(
@@ -382,7 +274,7 @@ def _with_excitation(
     ]
     at = np.array([drive.read_position() for drive in group.drives])
     here = [
-        replace(setting, loops=tuple(map(_without_feed_forward, group.drives, servos)), centre=at)
+        replace(setting, loops=tuple(map(without_feed_forward, group.drives, servos)), centre=at)
         for servos in (plan.old, plan.new)
     ]
     try:

@@ -7,6 +7,7 @@ is stored, the new ones.  What the trial raises takes the write back.
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -20,24 +21,16 @@ from drives.errors import (
     WriteBackMixedError,
 )
 from drives.parameters import Change
-from fieldtool.design.loops import Loops
-from fieldtool.design.machine import machine_of, respond
-from fieldtool.design.measured import (
-    AxisFigures,
-    Excited,
-    Sensitivity,
-    axis_figures,
-    measured_move,
-    measured_sensitivity,
-)
-from fieldtool.design.predict import Prediction
 from fieldtool.design.servo import Servo
 from fieldtool.design.tuning import Tuning, why_not_stored
 from fieldtool.design.verdict import Comparison, faults
 from fieldtool.errors import IdentificationError, OutputError
 from fieldtool.experiment.axes import Axes
+from fieldtool.experiment.verification.identity import IdentityWatch, Learned
 from fieldtool.experiment.verification.oscillation import HOLD_LEVEL
 from fieldtool.experiment.verification.trial import Tried, run_trial
+from fieldtool.experiment.verification.watch import Guards
+from fieldtool.experiment.verification.work import WorkWatch
 from fieldtool.records.model import FloatArray, MachineModel
 from fieldtool.records.recording import Experiment, RecordingWriter
 from fieldtool.records.yaml_file import write_yaml
@@ -50,13 +43,16 @@ from fieldtool.report.verification_picture import (
 from fieldtool.workflow.preparation import axes_of, recording_header, setting_of
 from fieldtool.workflow.rescued import keeping
 from fieldtool.workflow.session import Session
+from fieldtool.workflow.trial_loops import drive_loop
 from fieldtool.workflow.trial_plan import (
     TrialPlan,
     encoder_swing,
     plan_trial,
     torque_steps,
     wait_for_standstill,
+    without_feed_forward,
 )
+from fieldtool.workflow.trial_records import TrialRecords
 from fieldtool.workflow.verified import Verified
 from fieldtool.writeback.temporary import backed_up
 
@@ -103,6 +99,8 @@ class Verification:
         self._plan: TrialPlan | None = None
         self._changes: tuple[Change, ...] = ()
         self._old: Tried | None = None
+        self._identity: IdentityWatch | None = None
+        self._learned: Learned | None = None
         self._recorder: RecordingWriter | None = None
         self._histories: list[tuple[Comparison, History, History]] = []
         self.result: Verified | None = None
@@ -118,7 +116,10 @@ class Verification:
         """
         self._changes = tuple(changes)
         wait_for_standstill(self._group)
-        self._plan = plan_trial(self._group, self._setting, changes, self._bound, self._stated)
+        designed = self._tuning.prediction if self._believed else None
+        self._plan = plan_trial(
+            self._group, self._setting, changes, self._bound, self._stated, designed
+        )
         for note in self._plan.notes:
             self._session.warn(note)
         return self._plan
@@ -198,6 +199,10 @@ class Verification:
             raise OutputError(f"{path}: can not be removed ({error.strerror})") from error
 
     @property
+    def _records(self) -> TrialRecords:
+        return TrialRecords(self._planned, self._axes, self._setting.model)
+
+    @property
     def _planned(self) -> TrialPlan:
         if self._plan is None:
             raise AssertionError("a trial is planned first")
@@ -208,7 +213,8 @@ class Verification:
         cycle = self._planned.trial.cycle_time
         pairs = zip(self._group.drives, servos, strict=True)
         wait_for_standstill(self._group)
-        return run_trial(
+        guards = self._guards(servos)
+        tried = run_trial(
             self._group,
             self._planned.trial,
             self._axes,
@@ -217,17 +223,53 @@ class Verification:
             trusts_loops=trusts_loops,
             louder=self._louder(servos),
             steps=np.array([torque_steps(drive, servo, cycle) for drive, servo in pairs]),
+            guards=guards,
             report=self._session.screen.progress,
-            exciting=self._ready_to_excite,
+            exciting=partial(self._ready_to_excite, servos),
         )
+        if self._learned is None and self._identity is not None:
+            self._learned = self._identity.learned()
+        return tried
+
+    def _guards(self, servos: Sequence[Servo]) -> Guards:
+        """Return what compares torques with these controllers; while the old ones act it only learns."""
+        drives = self._group.drives
+        identity = IdentityWatch(
+            [drive_loop(*pair) for pair in zip(drives, servos, strict=True)],
+            self._planned.trial.cycle_time,
+            np.array([abs(drive.scaling.torque) for drive in drives]),
+            self._learned,
+            [drive.torque_unit for drive in drives],
+        )
+        self._identity = identity
+        if self._learned is None or self._old is None:
+            return Guards(identity)
+        for drive, why in zip(drives, identity.why_not, strict=True):
+            if why:
+                self._session.warn(
+                    f"{drive.axis}: whether the controller in its drive is the one that was written can "
+                    f"not be told from its torque: {why}. Swings, ways and torques are watched as ever."
+                )
+        limits = np.array([one.torque for one in self._axes.limits])
+        work = WorkWatch(
+            self._old.rest,
+            self._axes.counts,
+            limits,
+            self._axes.units,
+        )
+        return Guards(identity, work)
 
     @contextmanager
-    def _ready_to_excite(self) -> Iterator[None]:
+    def _ready_to_excite(self, servos: Sequence[Servo]) -> Iterator[None]:
         """Wait for standstill; where references excite, feed-forward would take most of the limits."""
         lines = self._planned.lines
         by_reference = lines is not None and not np.all(lines.by_torque)
         wait_for_standstill(self._group)
         with self._group.without_feed_forward() if by_reference else nullcontext():
+            if by_reference and self._identity is not None:
+                pairs = zip(self._group.drives, servos, strict=True)
+                bare = ((d, replace(s, loop=without_feed_forward(d, s))) for d, s in pairs)
+                self._identity.use([drive_loop(*pair) for pair in bare])
             yield
 
     def _louder(self, servos: Sequence[Servo]) -> FloatArray:
@@ -268,72 +310,15 @@ class Verification:
         plan = self._planned
         return tuple(
             text
-            for one in self._compared(tried)
+            for one in self._records.compared(self._old, tried)
             for text in faults(one, plan.trial.cycle_time, self._bound, believed=self._believed)
-        )
-
-    def _compared(self, new: Tried | None) -> tuple[Comparison, ...]:
-        plan = self._planned
-        return tuple(self._comparison(plan, k, new) for k in range(len(plan.moves)))
-
-    def _comparison(self, plan: TrialPlan, k: int, new: Tried | None) -> Comparison:
-        move = plan.moves[k]
-        old_curve = self._sensitivity(self._old, k, plan.old[k])
-        new_curve = self._sensitivity(new, k, plan.new[k])
-        frequency = None
-        for curve in (new_curve, old_curve):
-            if curve is not None:
-                frequency = curve.frequency
-        expected = None if frequency is None else self._predicted(plan.new, k, frequency)
-        return Comparison(
-            move.axis,
-            self._axes.unit(k),
-            move.distance,
-            move.duration,
-            move.settling_band,
-            _figures(self._old, k, move.axis, move.settling_band, old_curve),
-            _foreseen(plan.after, k, expected),
-            _figures(new, k, move.axis, move.settling_band, new_curve),
-            old_curve,
-            expected,
-            new_curve,
-        )
-
-    def _sensitivity(self, tried: Tried | None, k: int, servo: Servo) -> Sensitivity | None:
-        lines = self._planned.lines
-        if tried is None or lines is None:
-            return None
-        one = tried.excitation
-        if one is None or not one.complete or one.period is None:
-            return None
-        own = lines.axis == k
-        name = self._axes.names[k]
-        offset = one.extra.get(f"{name}.torque_offset") if np.all(lines.by_torque[own]) else None
-        step = self._planned.trial.cycle_time
-        rows = slice(-(one.samples // lines.samples - 1) * lines.samples, None)
-        return measured_sensitivity(
-            Excited(
-                lines.number[own],
-                lines.samples,
-                step,
-                one.position[rows, k],
-                one.torque[rows, k],
-                None if offset is None else offset[rows],
-            ),
-            servo,
-        )
-
-    def _predicted(self, servos: Sequence[Servo], k: int, frequency: FloatArray) -> Sensitivity:
-        response = respond(machine_of(self._setting.model), 2 * np.pi * frequency)
-        return Sensitivity(
-            frequency, np.abs(Loops(response, tuple(servos)).sensitivity[:, k]).astype(np.float64)
         )
 
     def _conclude(self, tried: Tried | None, reasons: tuple[str, ...]) -> None:
         """Say what was found; what the drives are left with is not known yet."""
-        compared = self._compared(tried)
+        compared = self._records.compared(self._old, tried)
         self._histories = [
-            (one, self._history(self._old, k), self._history(tried, k))
+            (one, self._records.history(self._old, k), self._records.history(tried, k))
             for k, one in enumerate(compared)
         ]
         moves = (
@@ -380,32 +365,6 @@ class Verification:
             draw_verification(self._histories, self._planned.after, folder.verification_picture)
         except Exception as failed:
             self._session.warn(f"{folder.verification_picture}: not drawn ({failed})")
-
-    def _history(self, tried: Tried | None, k: int) -> History:
-        """Return time, reference, position of an axis' own move, from where it began."""
-        one = None if tried is None else tried.move(self._axes.names[k])
-        if one is None or one.position_reference is None:
-            return None
-        reference = one.position_reference[:, k]
-        return one.time, reference - reference[0], one.position[:, k] - reference[0]
-
-
-def _figures(
-    tried: Tried | None, k: int, name: str, band: float, curve: Sensitivity | None
-) -> AxisFigures | None:
-    one = None if tried is None else tried.move(name)
-    if one is None or one.position_reference is None or not one.complete:
-        return None
-    moves = measured_move(one.time, one.position_reference[:, k], one.position[:, k], band)
-    torque = one.torque[:, k]
-    return axis_figures(moves, float(np.abs(torque - torque[0]).max()), curve)
-
-
-def _foreseen(prediction: Prediction, k: int, curve: Sensitivity | None) -> AxisFigures | None:
-    axis = prediction.axes[k]
-    if axis.move is None:
-        return None
-    return axis_figures([axis.move], axis.peak_torque, curve)
 
 
 def _what_moves(plan: TrialPlan, axes: Axes) -> str:

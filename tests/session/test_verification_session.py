@@ -3,6 +3,7 @@
 import json
 import os
 import signal
+import struct
 import time
 from contextlib import nullcontext
 
@@ -125,6 +126,63 @@ def test_a_disaster_behind_the_tools_back_is_caught_and_restored(session, monkey
     found = verification(session)
     assert found["verdict"] == "restored"
     assert found["reasons"]
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        (Gains(ARM, 10.0), "where its parameters make"),
+        (Gains(TABLE, 0.1), "where its parameters make"),
+        (Gains(TABLE, 10.0, (Parameter.INERTIA_FF,)), "its torque"),
+        (MotorReversed(TABLE), "against its own torque"),
+    ],
+)
+def test_what_is_not_as_written_is_stopped_at_some_counts(session, monkeypatch, fault, words):
+    """Before the nudge, which goes ten times as far: 0.0167 rad."""
+    forward = {axis: {**own, "inertia_ff": 0.05} for axis, own in GOOD.items()}
+    write_tuning(session, forward)
+    AfterWrite(session, monkeypatch, fault)
+    ways = Ways(session, monkeypatch)
+    outcome = write(session)
+    assert outcome.code == 6, outcome.err
+    assert words in " ".join(outcome.err.split())
+    assert ways.largest() < 1.5e-3
+    assert session.changed() == {}
+
+
+class Ways:
+    """Hears how far each drive's position goes while the new parameters are tried, rad."""
+
+    def __init__(self, bench, monkeypatch):
+        from fieldtool.workflow.verifying import Verification
+
+        self._heard = {}
+        prove = Verification.prove
+
+        def noted(one):
+            self._heard.clear()
+            prove(one)
+
+        monkeypatch.setattr(Verification, "prove", noted)
+        bench.machine.listen(self)
+
+    def __call__(self, _time, cob_id, data):
+        if 0x180 < cob_id < 0x200 and len(data) == 8:
+            _, position, _ = struct.unpack("<Hih", data)
+            self._heard.setdefault(cob_id, []).append(position)
+
+    def largest(self):
+        return max(np.ptp(one) for one in self._heard.values()) * 2 * np.pi / 2**20
+
+
+def test_gains_that_nobody_can_read_are_said_not_to_be_watched(session, monkeypatch):
+    from fieldtool.workflow import trial_loops
+
+    monkeypatch.setattr(trial_loops, "_why_not_told", lambda _: "velocity_p can not be read")
+    outcome = write(session)
+    assert outcome.code == 0, outcome.err
+    said = " ".join((outcome.err + outcome.out).split())
+    assert "table: whether the controller in its drive is the one that was written can not" in said
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,237 @@
+"""Is the controller in a drive the one that was written?  Told by its torque, within some cycles.
+
+The torque that a drive tells has to be that which its parameters make of target and position
+(:mod:`fieldtool.experiment.verification.controller`), whatever the machine does.  Of both the part is
+compared that is quicker than SETTLES, so nothing needs to be known of gravity, of friction, or of what
+the integrator holds.  A wrong gain, sign or filter shows in the first quick motion of the target, at
+some counts of the encoder and long before anything swings.
+
+What may differ is stated: noise, SHARE of what is expected, and the torque's change within the time by
+which the drive may be earlier or later than its profile says.  How noisy a drive's torque is, and how
+well it follows from its parameters at all, is learned while its old parameters are tried: a drive whose
+torque does not follow from its old ones is not judged by the new ones.
+
+It can not see a plant that is not as its model, nor a motor that pushes against what its drive asks for.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import exp
+
+import numpy as np
+
+from fieldtool.experiment.verification.controller import (
+    LATE,
+    POSITIONS,
+    REFERENCES,
+    DriveLoop,
+    ExpectedTorque,
+)
+from fieldtool.records.model import FloatArray
+
+SETTLES = 0.05
+"""Time constant, s: slower torques are not compared."""
+SHARE = 0.2
+"""Of the torque that is expected by which it may differ."""
+REMEMBERED = 0.015
+"""s, time constant with which what was expected is forgotten."""
+BUSY = 2.0
+"""Times the share of cycles in which an encoder counts that its steps make all their noise."""
+SEEN, OF = 5, 8
+"""Differences above what is allowed, of so many cycles, that are enough."""
+GLARING, LATELY = 3.0, 0.05
+"""Times what is allowed of which two differences are enough, within so many seconds."""
+BLIND, BLIND_AGAIN = 0.04, 0.1
+"""s from the beginning of a motion, and from a sample that did not come, in which nothing is said."""
+QUANTA, ENCODER, STILL = 3.0, 4.0, 3.0
+"""Steps of the torque, times the RMS of what encoders' steps make, and times what was seen while all
+axes stood still, by which torques may differ at any time."""
+LEARNED, LEAST_LEARNED, MOST_LEARNED = 2.0, 0.5, 3.0
+"""Times the difference that was seen with the old parameters that is allowed with the new ones; of the
+usual one at least; and times the usual one above which a drive is not judged."""
+
+
+@dataclass(frozen=True, eq=False)
+class Learned:
+    """How well torques followed from parameters that are known to be in the drives; shapes (M,)."""
+
+    still: FloatArray
+    """Largest lasting difference while the axes stood still, N m or N."""
+    share: FloatArray
+    """Largest lasting difference of all, over what is usually allowed."""
+
+    def why_not(self) -> tuple[str, ...]:
+        """Return for each axis why it can not be judged by what was seen; empty where it can."""
+        return tuple(
+            f"with its old parameters its torque was up to {share:.2g} times as far from what they make "
+            "of target and position as is usual"
+            if LEARNED * share > MOST_LEARNED
+            else ""
+            for share in self.share.tolist()
+        )
+
+
+class IdentityWatch:
+    """Compares the torques of one trial with those that its parameters should make.
+
+    Parameters
+    ----------
+    loops
+        What should be in their drives.
+    step
+        Cycle time, s.
+    quanta
+        Steps in which torques are told, (M,), N m or N.
+    learned
+        From the trial of the old parameters; None: this is that trial, nothing is said, only learned.
+    units
+        Of torques, one an axis, for messages.
+    """
+
+    def __init__(
+        self,
+        loops: Sequence[DriveLoop],
+        step: float,
+        quanta: FloatArray,
+        learned: Learned | None = None,
+        units: Sequence[str] = (),
+    ) -> None:
+        self._step, self._learned = step, learned
+        m = len(loops)
+        self._units = tuple(units) or ("",) * m
+        self._quanta = quanta
+        self._still, self._share = np.zeros(m), np.zeros(m)
+        self._passed = SETTLES / (SETTLES + step)
+        self._kept = exp(-step / REMEMBERED)
+        self._standing = True
+        self.use(loops)
+
+    def use(self, loops: Sequence[DriveLoop]) -> None:
+        """Go on with other controllers: what is switched off for an excitation, say."""
+        self._expected = ExpectedTorque(loops, self._step)
+        learned = self._learned
+        refused = ("",) * len(loops) if learned is None else learned.why_not()
+        self.why_not = tuple(loop.why_not or why for loop, why in zip(loops, refused, strict=True))
+        """For each axis why nothing is said of it; empty where it is judged."""
+        self._judged = [not why for why in self.why_not]
+        late = np.array([loop.unsure for loop in loops])
+        self._late = np.array([late + [loop.unsure_targets for loop in loops], late])
+        self._half = 0.5 * np.array([loop.count for loop in loops])
+        self._encoder = ENCODER * np.array([loop.noise for loop in loops])
+        self._floor = QUANTA * self._quanta
+        self._scale = np.ones(len(loops))
+        if learned is not None:
+            self._floor = self._floor + STILL * learned.still
+            self._scale = np.maximum(LEAST_LEARNED, LEARNED * learned.share)
+        self.begin()
+
+    def begin(self) -> None:
+        """Another motion begins."""
+        self._rows: list[tuple[FloatArray, FloatArray, FloatArray, FloatArray]] = []
+        self._origin: FloatArray | None = None
+        self._blind = round(BLIND / self._step)
+
+    def stand(self, *, still: bool) -> None:
+        """Say whether all axes are told to stand still from now on."""
+        self._standing = still
+
+    def learned(self) -> Learned:
+        """Return what was seen so far."""
+        return Learned(self._still.copy(), self._share.copy())
+
+    def take(
+        self,
+        position: Sequence[float],
+        torque: Sequence[float],
+        target: Sequence[float],
+        offset: Sequence[float],
+        *,
+        fresh: bool,
+    ) -> list[tuple[int, str]]:
+        """Take one SYNC of all axes; return those whose torque is not theirs, with a sentence each."""
+        if not fresh:
+            self.begin()
+            self._blind = round(BLIND_AGAIN / self._step)
+            return []
+        row = tuple(np.array(one, dtype=np.float64) for one in (position, torque, target, offset))
+        if self._origin is None:
+            self._start(row[0], row[1])
+        self._rows.append((row[0], row[1], row[2], row[3]))
+        if len(self._rows) <= REFERENCES + LATE - 1:
+            return []
+        del self._rows[: -REFERENCES - LATE]
+        return self._compare()
+
+    def _start(self, position: FloatArray, torque: FloatArray) -> None:
+        m = position.size
+        self._origin = position
+        self._expected.restart()
+        self._before = np.zeros((3, m))
+        self._before[2] = torque
+        self._quick = np.zeros((3, m))
+        self._peak, self._slope, self._busy = np.zeros(m), np.zeros((2, m)), np.zeros(m)
+        self._over: list[FloatArray] = []
+        self._far: list[FloatArray] = []
+        self._glared = np.full(m, -np.inf)
+        self._count = 0
+
+    def _compare(self) -> list[tuple[int, str]]:
+        rows, origin = self._rows, self._rows[0][0] if self._origin is None else self._origin
+        targets = np.stack(
+            [*(one[2] - origin for one in rows[:REFERENCES]), rows[REFERENCES - 1][3]]
+        )
+        positions = np.stack([one[0] - origin for one in rows[-POSITIONS:]])
+        now = np.empty_like(self._before)
+        now[:2] = self._expected.advance(targets.T, positions.T)
+        now[2] = rows[-LATE][1]
+        quick = self._passed * (self._quick + now - self._before)
+        slope = np.abs(quick[:2] - self._quick[:2]) / self._step
+        self._before, self._quick = now, quick
+        expected = quick[0] + quick[1]
+        difference = np.abs(quick[2] - expected)
+        self._peak = np.maximum(np.abs(expected), self._kept * self._peak)
+        self._slope = np.maximum(slope, self._kept * self._slope)
+        counts = np.abs(rows[-LATE][0] - rows[-LATE - 1][0]) > self._half
+        self._busy = self._kept * self._busy + (1 - self._kept) * counts
+        allowed = self._floor + SHARE * self._peak + (self._late * self._slope).sum(axis=0)
+        if self._learned is None:
+            allowed = allowed + STILL * self._still  # noise is no share of anything
+        self._count += 1
+        if self._count <= self._blind:
+            return []
+        most = allowed + self._encoder
+        allowed = allowed + np.minimum(BUSY * self._busy, 1.0) * self._encoder
+        self._over = [*self._over[1 - OF :], difference / allowed]
+        self._far = [*self._far[1 - OF :], difference]
+        if len(self._over) < SEEN:
+            return []
+        return self._found(allowed, difference / most)
+
+    def _found(self, allowed: FloatArray, single: FloatArray) -> list[tuple[int, str]]:
+        over = np.sort(np.array(self._over), axis=0)[-SEEN]
+        if self._learned is None:
+            self._learn(over, np.sort(np.array(self._far), axis=0)[-SEEN])
+            return []
+        glares = single > GLARING * self._scale
+        again = glares & (self._count - self._glared < LATELY / self._step)
+        self._glared = np.where(glares, self._count, self._glared)
+        return [
+            (k, self._sentence(k, float(self._scale[k] * allowed[k])))
+            for k in np.flatnonzero((over > self._scale) | again).tolist()
+            if self._judged[k]
+        ]
+
+    def _learn(self, over: FloatArray, far: FloatArray) -> None:
+        if self._standing:
+            self._still = np.maximum(self._still, far)
+        else:
+            self._share = np.maximum(self._share, over)
+
+    def _sentence(self, k: int, allowed: float) -> str:
+        expected, told = float(self._quick[0, k] + self._quick[1, k]), float(self._quick[2, k])
+        unit = self._units[k]
+        return (
+            f"its torque is {told:.3g} {unit} where its parameters make {expected:.3g} {unit} of its "
+            f"target and position (slow torques left out; {allowed:.2g} {unit} off is taken): what acts "
+            "in the drive is not what was written"
+        )

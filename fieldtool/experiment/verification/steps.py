@@ -1,0 +1,206 @@
+"""The steps of a trial in one motion, each axis by itself: first answer, nudge, move."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import partial
+
+import numpy as np
+
+from drives.api import Capture, FloatArray, Motion
+from drives.errors import StoppedError
+from fieldtool.experiment.axes import Axes, sample_times
+from fieldtool.experiment.directions import CHECK_PUSHED
+from fieldtool.experiment.stepped.plan import smooth_move
+from fieldtool.experiment.verification.oscillation import LONGEST_HALF
+from fieldtool.experiment.verification.slices import SENT_AHEAD, SLICE_TIME, Turn, slices
+from fieldtool.experiment.verification.watch import TrialWatch
+from fieldtool.records.recording import Experiment
+
+NUDGE_SHARE, NUDGE_TIME, NUDGE_COUNTS = 0.02, 0.5, 20.0
+"""A nudge is this share of the move, or so many counts of the encoder; seconds for each way."""
+NUDGE_TORQUE = 0.3
+"""Share of the torque limit that a nudge may take."""
+BEYOND, BEHIND = 0.5, 0.15
+"""Shares of a move by which it may be overshot, and by which the axis may go the wrong way."""
+SHAKEN = 4.0
+"""Times what an axis may go at rest that it may be beside its way: the others' moves shake it."""
+PUSHED_ERROR = 0.3
+"""Share of its following error limit by which an axis may be pushed that does not move itself."""
+PROBE_REST = 0.12
+"""Seconds that are watched after a first answer."""
+NO_PROBE: FloatArray = np.zeros(0)
+
+
+@dataclass(frozen=True, eq=False)
+class TrialMove:
+    """One axis' move out, as displacements; it comes back the same way."""
+
+    axis: int
+    reference: FloatArray
+    """From 0 to the distance, shape (n,), rad or m."""
+    rest: int
+    """Cycles that are watched after it, and after the way back."""
+    torque: FloatArray
+    """How far torques may go from those at rest meanwhile, shape (M,)."""
+    half_period: float = LONGEST_HALF
+    """Seconds from turn to turn below which torque and position do not turn by what is commanded while
+    the reference moves."""
+    swings: tuple[float, float] | None = None
+    """Peak to peak of torque and position of the axis once its reference stands, at most; None: not
+    known."""
+    astray: float = np.inf
+    """Distance from the target once the reference stands, at most, rad or m."""
+
+    probe: FloatArray = field(default_factory=lambda: NO_PROBE)
+    """Some counts to and fro in some cycles, from 0 to 0, shape (n,), that the controller is known by;
+    empty: none."""
+
+    @property
+    def distance(self) -> float:
+        """With its sign."""
+        return float(self.reference[-1])
+
+
+class Steps:
+    """Nudges and moves of one motion."""
+
+    def __init__(
+        self,
+        motion: Motion,
+        watch: TrialWatch,
+        axes: Axes,
+        still: FloatArray,
+        start: FloatArray,
+        name: str,
+        kept: list[Experiment],
+    ) -> None:
+        self._motion, self._watch, self._axes = motion, watch, axes
+        self._still, self._start, self._name, self._kept = still, start, name, kept
+
+    def probe(self, move: TrialMove) -> None:
+        """Have an axis' controller answer before anything else moves: to some counts, in some cycles."""
+        if not move.probe.size:
+            return
+        k, step = move.axis, self._motion.cycle_time
+        torque = np.minimum(self._gentle_torque, move.torque)
+        low, high = self._ways(k, float(move.probe[np.argmax(np.abs(move.probe))]), 0.0)
+        self._watch.move(small=True)
+        self._watch.swings.move(low, high, torque, PROBE_REST / 3, axis=k)
+        path = np.concatenate([move.probe, np.zeros(round(PROBE_REST / step))])
+        self._stream(path, k, f"{self._name}: first answer of {self._axes.names[k]}", keep=False)
+
+    @property
+    def _gentle_torque(self) -> FloatArray:
+        return NUDGE_TORQUE * np.array([one.torque for one in self._axes.limits])
+
+    def nudge(self, move: TrialMove) -> None:
+        """Go a little way and back; the axis has to go there, and no other may move."""
+        axes, k, step = self._axes, move.axis, self._motion.cycle_time
+        size = max(NUDGE_SHARE * abs(move.distance), NUDGE_COUNTS * float(axes.counts[k]))
+        size = float(np.copysign(min(size, abs(move.distance)), move.distance))
+        limits = axes.limits[k]
+        there = smooth_move(size, limits.velocity, limits.acceleration, step, NUDGE_TIME)
+        pause = np.full(max(2, round(NUDGE_TIME / step)), 1.0)
+        path = np.concatenate([there, size * pause, size - there, 0 * pause])
+        low, high = self._ways(k, size, BEYOND * abs(size))
+        torque = np.minimum(self._gentle_torque, move.torque)
+        self._watch.move(small=True)
+        self._watch.swings.move(low, high, torque, NUDGE_TIME / 3, axis=k, gentle=True)
+        self._stream(path, move.axis, f"{self._name}: nudge of {axes.names[k]}", keep=False)
+
+    def move(self, move: TrialMove) -> None:
+        """Go the whole way, rest, come back, rest."""
+        out, rest = move.reference, np.ones(move.rest)
+        self._watch.move(small=False)
+        path = np.concatenate([out, move.distance * rest, move.distance - out, 0 * rest])
+        self._allow(move)
+        name = f"{self._name}: move of {self._axes.names[move.axis]}"
+        half = out.size + move.rest
+        late = SENT_AHEAD * round(SLICE_TIME / self._motion.cycle_time)
+        turns = [(half, partial(self._allow, move, back=True))]
+        if late < move.rest:
+            turns = [
+                (out.size + late, partial(self._settle, move, back=False)),
+                *turns,
+                (half + out.size + late, partial(self._settle, move, back=True)),
+            ]
+        self._stream(path, move.axis, name, turns=turns)
+
+    def _settle(self, move: TrialMove, *, back: bool) -> None:
+        """Allow the axis what is left of its move, about its target."""
+        k = move.axis
+        low, high = self._ways(k, move.distance, self._beyond(move), back=back)
+        target = float(self._start[k]) + (0.0 if back else move.distance)
+        room = move.astray + SHAKEN * float(self._still[k])
+        low[k], high[k] = max(low[k], target - room), min(high[k], target + room)
+        self._watch.swings.settle(low, high, move.torque, move.half_period, k, move.swings)
+
+    def _allow(self, move: TrialMove, *, back: bool = False) -> None:
+        """Allow an axis its way out, or the way back."""
+        low, high = self._ways(move.axis, move.distance, self._beyond(move), back=back)
+        self._watch.swings.move(low, high, move.torque, move.half_period, axis=move.axis)
+
+    @staticmethod
+    def _beyond(move: TrialMove) -> float:
+        """Return how far the axis may go beyond the end of its way, rad or m."""
+        return min(BEYOND * abs(move.distance), move.astray)
+
+    def _ways(
+        self, k: int, distance: float, beyond: float, *, back: bool = False
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the corridors of a way, which may be overshot at its own end."""
+        errors = np.array([one.following_error for one in self._axes.limits])
+        slack = np.maximum(CHECK_PUSHED * self._still, PUSHED_ERROR * errors)
+        low, high = self._start - slack, self._start + slack
+        slack_k = SHAKEN * float(self._still[k])
+        size, behind = abs(distance), BEHIND * abs(distance)
+        way = (-beyond, size + behind) if back else (-behind, size + beyond)
+        ends = way if distance > 0 else (-way[0], -way[1])
+        low[k] = self._start[k] + min(ends) - slack_k
+        high[k] = self._start[k] + max(ends) + slack_k
+        return low, high
+
+    def _stream(
+        self,
+        path: FloatArray,
+        k: int,
+        name: str,
+        *,
+        keep: bool = True,
+        turns: Sequence[Turn] = (),
+    ) -> None:
+        """Follow a path."""
+        targets = np.tile(self._start, (path.size, 1))
+        targets[:, k] += path
+        try:
+            capture = self._motion.stream(slices(targets, self._motion.cycle_time, turns))
+        except StoppedError as error:
+            if isinstance(error.capture, Capture) and error.capture.rows > 1:
+                self._kept.append(self._experiment(error.capture, k, name, str(error)))
+            raise
+        if keep:
+            self._kept.append(self._experiment(capture, k, name))
+
+    def _experiment(self, capture: Capture, k: int, name: str, note: str = "") -> Experiment:
+        driven = (self._axes.names[k],)
+        return recorded(capture, driven, name, self._motion.cycle_time, note)
+
+
+def recorded(
+    capture: Capture, driven: tuple[str, ...], name: str, cycle_time: float, note: str
+) -> Experiment:
+    """Return a capture as an experiment; a note says what cut it short."""
+    return Experiment(
+        name=name,
+        kind="moves",
+        driven=driven,
+        free=(),
+        period=None,
+        time=sample_times(capture.rows, cycle_time),
+        position=capture.position,
+        torque=capture.torque,
+        position_reference=capture.position_reference,
+        statusword=capture.statusword,
+        complete=not note and not capture.missing,
+        note=note or ("samples are missing" if capture.missing else ""),
+    )

@@ -1,0 +1,83 @@
+"""All that watches a trial in every cycle, behind one door: swings, the controllers, the work."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from drives.api import Alarm, FloatArray
+from fieldtool.experiment.verification.identity import IdentityWatch
+from fieldtool.experiment.verification.oscillation import OscillationWatch
+from fieldtool.experiment.verification.work import WorkWatch
+
+
+@dataclass(frozen=True)
+class Guards:
+    """What else watches a trial besides the watch for swings; None: nobody does."""
+
+    identity: IdentityWatch | None = None
+    """Whether drives' torques are those of their controllers."""
+    work: WorkWatch | None = None
+    """Whether motors push the way they are asked to; while the axes hold still and are nudged."""
+
+
+class TrialWatch:
+    """Lets each of the watches look at every cycle; a ``drives.api.MotionWatch``."""
+
+    def __init__(self, names: Sequence[str], swings: OscillationWatch, guards: Guards) -> None:
+        self._names, self.swings, self._guards = tuple(names), swings, guards
+        self._small = True
+
+    @property
+    def trusts_loops(self) -> bool:
+        """Whether a quick stop may be left to the drives' loops."""
+        return self.swings.trusts_loops
+
+    def begin(self) -> None:
+        """Another motion begins: its axes stand still where they are first seen."""
+        self.swings.begin()
+        self._small = True
+        if self._guards.identity is not None:
+            self._guards.identity.begin()
+        if self._guards.work is not None:
+            self._guards.work.begin()
+
+    def hold(self, at: FloatArray) -> None:
+        """Allow no more than standing still at positions, shape (M,)."""
+        self.swings.hold(at)
+        if self._guards.identity is not None:
+            self._guards.identity.stand(still=True)
+
+    def move(self, *, small: bool) -> None:
+        """Say that targets move from now on; small motions leave gravity as it is."""
+        if small and self._guards.work is not None:
+            self._guards.work.begin()
+        self._small = small
+        if self._guards.identity is not None:
+            self._guards.identity.stand(still=False)
+
+    def take(
+        self,
+        position: Sequence[float],
+        torque: Sequence[float],
+        target: Sequence[float],
+        offset: Sequence[float],
+        *,
+        fresh: bool,
+    ) -> Alarm | None:
+        """Take one cycle; see ``drives.api.MotionWatch``."""
+        alarm = self.swings.take(position, torque)
+        if alarm is not None:
+            return alarm
+        found: list[tuple[int, str]] = []
+        guards = self._guards
+        if guards.identity is not None:
+            found += guards.identity.take(position, torque, target, offset, fresh=fresh)
+        if guards.work is not None and self._small:
+            found += guards.work.take(position, torque, fresh=fresh)
+        if not found:
+            return None
+        k, text = found[0]
+        return Alarm(
+            f"{self._names[k]}: {text}; its power was cut and all axes were stopped.",
+            self._names[k],
+            frozenset(self._names[j] for j, _ in found),
+        )

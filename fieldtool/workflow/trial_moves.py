@@ -1,0 +1,160 @@
+"""An axis' move in a trial: where it goes, how long it is watched, what it may do meanwhile."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from drives.canopen_drive import CanopenDrive
+from fieldtool.design.moves import TestMove
+from fieldtool.design.predict import Prediction
+from fieldtool.errors import PlanRefusedError
+from fieldtool.experiment.forecast import Setting
+from fieldtool.experiment.verification.swings import Swings
+from fieldtool.experiment.verification.trial import TrialMove
+from fieldtool.records.model import FloatArray
+
+ROOM = 0.6
+"""Of the way to the end of the travel that a move may use: it may overshoot."""
+FEWEST_COUNTS, BAND_COUNTS = 100.0, 4.0
+"""Counts of the encoder that a move, and the band about its target, have at least."""
+KEPT = 0.85
+"""Of the limits of torque, velocity and following error that a move may take by prediction."""
+SWELLS, BESIDE = 1.6, 0.15
+"""Times the predicted torque, and share of the limit besides, that a move may take; never more than
+MOST of the limit, and OTHERS of it on axes that are not moved."""
+MOST, OTHERS = 0.97, 0.95
+REST, LEAST_REST, MOST_REST = 2.0, 0.5, 6.0
+"""Times the predicted settling for which a move is watched after its end; at least, at most, s."""
+UNFORESEEN, OFF_TARGET = 2.0, 0.05
+"""Times what is predicted that an axis may swing and be off its target once its reference stands; and
+the share of the way by which it may be off besides."""
+FINE_SWING = 0.02
+"""Of the limit of torque, or of the band about the target: smaller swings are left out."""
+ACCELERATES = 0.6
+"""Share of the time to speed up below which a torque that turns back is not the move's own."""
+
+
+def free_move(drive: CanopenDrive, typical: TestMove) -> TestMove:
+    """Return an axis' typical move from where it stands, as far as there is room for it.
+
+    It goes its own way where that fits, else towards the farther end of the travel.
+
+    Raises
+    ------
+    PlanRefusedError
+        If there is no room.
+    """
+    limits = drive.limits
+    at = drive.read_position()
+    down, up = at - limits.travel[0], limits.travel[1] - at
+    room = {1.0: ROOM * up, -1.0: ROOM * down}
+    sign = float(np.sign(typical.distance))
+    if abs(typical.distance) > room[sign]:
+        sign = 1.0 if up >= down else -1.0
+    way = min(abs(typical.distance), room[sign])
+    counts = abs(drive.scaling.position)
+    if way < FEWEST_COUNTS * counts:
+        raise PlanRefusedError(
+            f"{drive.axis}: stands at {at:.4g} {drive.position_unit} and has no room to move. Nothing "
+            "was moved or written. Move it away from the end of its travel."
+        )
+    band = max(typical.settling_band * way / abs(typical.distance), BAND_COUNTS * counts)
+    return replace(typical, distance=sign * way, band=band)
+
+
+def takes_too_much(setting: Setting, k: int, predictions: Sequence[Prediction]) -> bool:
+    """Return whether an axis' move comes too near to a limit by one of these predictions."""
+    limits = setting.limits[k]
+    for prediction in predictions:
+        one = prediction.axes[k]
+        if one.curves is None or one.move is None:
+            continue
+        speed = float(np.abs(np.gradient(one.curves.position, one.curves.time)).max())
+        if (
+            one.peak_torque > KEPT * limits.torque
+            or one.move.following_error > KEPT * limits.following_error
+            or speed > KEPT * limits.velocity
+        ):
+            return True
+    return False
+
+
+def trial_move(
+    move: TestMove,
+    k: int,
+    cycle: float,
+    limits: FloatArray,
+    steps: float,
+    predictions: Sequence[Prediction],
+    answer: FloatArray,
+) -> TrialMove:
+    """Return an axis' move with what it may do by any of these predictions.
+
+    Parameters
+    ----------
+    move, k
+        Of the axis; its index.
+    cycle
+        s.
+    limits
+        Of all torques, (M,).
+    steps
+        By how much its torque may swing because targets are whole counts, peak to peak.
+    predictions
+        With the loops that it will meet.
+    answer
+        See :func:`fieldtool.workflow.trial_loops.first_answer`.
+    """
+    known = [one.axes[k] for one in predictions if one.axes[k].move is not None]
+    peak = max((one.peak_torque for one in known), default=0.0)
+    torque = OTHERS * limits
+    torque[k] = min(SWELLS * peak + BESIDE * limits[k] + steps / 2, MOST * limits[k])
+    settles = max(
+        (
+            one.move.settling_time
+            for one in known
+            if one.move is not None and np.isfinite(one.move.settling_time)
+        ),
+        default=MOST_REST,
+    )
+    rest = min(max(REST * settles, LEAST_REST, move.duration), MOST_REST)
+    rise, held, _ = move.parts
+    half = ACCELERATES * (2 * rise + held)
+    swings, astray = _coming_to_rest(move, k, limits[k], predictions)
+    reference = move.reference(cycle)
+    return TrialMove(k, reference, round(rest / cycle), torque, half, swings, astray, answer)
+
+
+def _coming_to_rest(
+    move: TestMove, k: int, limit: float, predictions: Sequence[Prediction]
+) -> tuple[tuple[float, float] | None, float]:
+    """Return how far an axis may swing once its reference stands, and how far it may be off its target.
+
+    Every prediction counts UNFORESEEN times; None and infinite where there is none.
+    """
+    curves = [one.axes[k].curves for one in predictions]
+    after = [(c.torque, c.position, c.time >= move.duration) for c in curves if c is not None]
+    if len(after) < len(curves):
+        return None, np.inf
+    torque = max(_second_swing(t[rest], FINE_SWING * limit) for t, _, rest in after)
+    position = max(_second_swing(p[rest], FINE_SWING * move.settling_band) for _, p, rest in after)
+    sign = np.sign(move.distance)
+    off = max(
+        float(
+            max(
+                np.abs(p[rest] - move.distance).max(initial=0.0), (sign * (p - move.distance)).max()
+            )
+        )
+        for _, p, rest in after
+    )
+    astray = UNFORESEEN * off + OFF_TARGET * abs(move.distance)
+    return (UNFORESEEN * torque, UNFORESEEN * position), astray
+
+
+def _second_swing(signal: FloatArray, fine: float) -> float:
+    """Return the second largest swing from turn to turn: what an alarm after two of them would see."""
+    swings = Swings()
+    swings.restart(fine)
+    sizes = [swings.sizes[-1] for value in signal.tolist() if swings.take(value)]
+    return sorted([0.0, 0.0, *sizes])[-2]

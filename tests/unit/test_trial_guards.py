@@ -1,0 +1,267 @@
+"""Is the controller the one that was written, and does its motor push the way it is asked to?
+
+The drive and its machine are simulated here step by step, by a loop of their own, not by the tool's
+matrices.
+"""
+
+from dataclasses import dataclass, replace
+from math import copysign, exp
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fieldtool.design.servo import Servo, Timing
+from fieldtool.experiment.verification.controller import DriveLoop, ExpectedTorque, locked_torque
+from fieldtool.experiment.verification.identity import BLIND, IdentityWatch, Learned
+from fieldtool.experiment.verification.work import WorkWatch
+from fieldtool.records.closed_loop import AxisLoop, Biquad
+from fieldtool.workflow.trial_loops import first_answer
+
+STEP, PERIOD, LAG = 1e-3, 0.125e-3, 0.16e-3
+COUNT = 2 * np.pi / 2**20
+INERTIA, LIMIT = 0.5, 40.0
+GOOD = AxisLoop(30.0, 60.0 * INERTIA, 60.0 * 15.0 * INERTIA, 1.0, 0.9 * INERTIA)
+
+
+@dataclass
+class Axis:
+    """A motor with a load on a spring and its drive, stepped at the rate of the drive's loops."""
+
+    loop: AxisLoop
+    sign: float = 1.0
+    friction: float = 0.0
+    load: float = 0.4 * INERTIA
+    spring: float = 0.4 * INERTIA * (2 * np.pi * 15.0) ** 2
+
+    def run(self, targets, noise=0.0, seed=0, count=COUNT):
+        """Return positions and torques as they are told at each SYNC, (n,) each."""
+        rng = np.random.default_rng(seed)
+        motor, loop = INERTIA - self.load, self.loop
+        q1 = q2 = v1 = v2 = seen = integral = torque = last = before = 0.0
+        memory = [[0.0, 0.0] for _ in loop.filters]
+        follow, damping = 1 - exp(-PERIOD / LAG), 0.02 * self.load * 90
+        told = []
+        for target in targets.tolist():
+            told.append((round(q1 / count) * count, torque + noise * rng.standard_normal()))
+            speed, bend = (target - last) / STEP, (target - 2 * last + before) / STEP**2
+            for k in range(8):
+                position = round(q1 / count) * count
+                velocity, seen = (position - seen) / PERIOD, position
+                reference = last + (target - last) * k / 8
+                error = loop.position_p * (reference - position) + speed - velocity
+                wanted = loop.velocity_p * error + integral + loop.inertia_ff * bend
+                integral += loop.velocity_i * PERIOD * error
+                for one, state in zip(loop.filters, memory, strict=True):
+                    wanted = filtered(one, state, wanted)
+                torque += follow * (min(max(wanted, -LIMIT), LIMIT) - torque)
+                pull = self.spring * (q2 - q1)
+                push = self.sign * torque + pull
+                if abs(v1) < 1e-6 and abs(push) <= self.friction:
+                    v1 = 0.0
+                else:
+                    slid = v1 + PERIOD * (push - copysign(self.friction, v1 or push)) / motor
+                    v1 = 0.0 if slid * v1 < 0 else slid
+                v2 += PERIOD * (-pull - damping * (v2 - v1)) / self.load
+                q1, q2 = q1 + PERIOD * v1, q2 + PERIOD * v2
+            before, last = last, target
+        position, torques = np.array(told).T
+        return position, torques
+
+
+def filtered(one, state, value):
+    """A filter by small steps of its own differential equation (implicit Euler)."""
+    (n2, n1, n0), (d1, d0) = one.numerator, one.denominator
+    h = PERIOD
+    x, dx = state
+    dx = (dx + h * (value - d0 * x)) / (1 + h * d1 + h * h * d0)
+    x = x + h * dx
+    state[:] = [x, dx]
+    return n2 * (value - d1 * dx - d0 * x) + n1 * dx + n0 * x
+
+
+def drive(loop, **changes):
+    noise = Servo(loop, timing=Timing(LAG, PERIOD)).torque_noise(COUNT)
+    one = DriveLoop(
+        loop, period=PERIOD, lag=LAG + PERIOD / 2, unsure=0.1e-3, noise=noise, count=COUNT
+    )
+    return replace(one, **changes)
+
+
+def trial_path(loop, count=COUNT, hold=100):
+    answer = first_answer([drive(loop)], count, LIMIT, 0.5, STEP)
+    u = np.arange(200) * STEP / 0.2
+    nudge = np.round(0.01 * u**3 * (10 - 15 * u + 6 * u * u) / count) * count
+    return np.concatenate(
+        [np.zeros(hold), answer, np.zeros(120), nudge, nudge[-1] - nudge, np.zeros(50)]
+    ), hold
+
+
+def watch(loop, learned=None, noise=0.0, **changes):
+    quanta = np.array([max(noise, 0.01)])
+    if learned is None:
+        learned = Learned(np.array([2 * noise]), np.array([0.3]))
+    return IdentityWatch([drive(loop, **changes)], STEP, quanta, learned, ["N m"])
+
+
+def first_alarm(one, position, torque, target):
+    for n, (q, t, r) in enumerate(zip(position, torque, target, strict=True)):
+        if one.take([q], [t], [r], [0.0], fresh=True):
+            return n
+    return None
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    bandwidth=st.floats(15.0, 120.0),
+    ratio=st.floats(2.0, 5.0),
+    ahead=st.floats(0.0, 1.0),
+    friction=st.floats(0.0, 4.0),
+    noise=st.floats(0.0, 0.03),
+    notch=st.booleans(),
+    seed=st.integers(0, 2**31),
+)
+def test_a_controller_that_was_written_is_never_doubted(
+    bandwidth, ratio, ahead, friction, noise, notch, seed
+):
+    filters = (Biquad.notch(120.0, 0.1, 0.7),) if notch else ()
+    loop = AxisLoop(
+        bandwidth / ratio,
+        bandwidth * INERTIA,
+        bandwidth**2 / 4 * INERTIA,
+        1.0,
+        ahead * INERTIA,
+        filters,
+    )
+    target, _ = trial_path(loop)
+    sigma = noise * LIMIT
+    position, torque = Axis(loop, friction=friction).run(target, sigma, seed)
+    assert first_alarm(watch(loop, noise=sigma), position, torque, target) is None
+
+
+WRONG = {
+    "gains ten times too high": {"velocity_p": 10.0, "velocity_i": 10.0},
+    "gains of the wrong sign": {"velocity_p": -1.0, "velocity_i": -1.0},
+    "feed-forward three times too high": {"inertia_ff": 3.0},
+}
+
+
+@pytest.mark.parametrize("what", WRONG)
+def test_another_controller_shows_in_its_first_answer_within_some_counts(what):
+    held = replace(
+        GOOD, **{name: factor * getattr(GOOD, name) for name, factor in WRONG[what].items()}
+    )
+    target, hold = trial_path(GOOD)
+    position, torque = Axis(held).run(target, 0.02, 3)
+    found = first_alarm(watch(GOOD, noise=0.02), position, torque, target)
+    assert found is not None
+    assert found <= hold + 50
+    assert np.abs(position[:found]).max() < 500 * COUNT
+
+
+def test_a_filter_that_was_not_written_shows_in_the_first_answer():
+    target, hold = trial_path(GOOD)
+    held = replace(GOOD, filters=(Biquad.low_pass(40.0, 0.7),))
+    position, torque = Axis(held).run(target, 0.02, 3)
+    found = first_alarm(watch(GOOD, noise=0.02), position, torque, target)
+    assert found is not None
+    assert found <= hold + 30
+
+
+def test_a_drive_whose_old_torque_did_not_follow_from_its_parameters_is_not_judged():
+    target, _ = trial_path(GOOD)
+    other = replace(GOOD, velocity_p=8 * GOOD.velocity_p, inertia_ff=0.0)
+    position, torque = Axis(other).run(target, 0.02, 3)
+    before = IdentityWatch([drive(GOOD)], STEP, np.array([0.02]), None)
+    for n, (q, t, r) in enumerate(zip(position, torque, target, strict=True)):
+        before.stand(still=n < 100)
+        assert not before.take([q], [t], [r], [0.0], fresh=True)
+    after = watch(GOOD, before.learned(), noise=0.02)
+    assert "old parameters" in after.why_not[0]
+    assert first_alarm(after, position, torque, target) is None
+
+
+def test_nothing_is_said_of_gains_that_nobody_can_read():
+    target, _ = trial_path(GOOD)
+    position, torque = Axis(replace(GOOD, velocity_p=10 * GOOD.velocity_p)).run(target)
+    one = watch(GOOD, why_not="velocity_p can not be read")
+    assert one.why_not == ("velocity_p can not be read",)
+    assert first_alarm(one, position, torque, target) is None
+
+
+def test_samples_that_did_not_come_are_no_mismatch():
+    target, hold = trial_path(GOOD)
+    position, torque = Axis(GOOD).run(target, 0.02, 1)
+    one = watch(GOOD, noise=0.02)
+    for n, (q, t, r) in enumerate(zip(position, torque, target, strict=True)):
+        missing = n % 90 == 7
+        at = max(n - 3, 0) if missing else n
+        found = one.take(
+            [position[at] if missing else q],
+            [torque[at] if missing else t],
+            [r],
+            [0.0],
+            fresh=not missing,
+        )
+        assert not found
+    assert hold * STEP > BLIND
+
+
+def test_the_torque_of_a_locked_axis_is_the_same_by_both_ways():
+    target, _ = trial_path(GOOD, hold=5)
+    _, torque = Axis(GOOD, friction=1e9).run(target[:40])
+    expected = locked_torque(drive(GOOD), target[:40], STEP)
+    assert expected[1:] == pytest.approx(torque[1:], rel=0.02, abs=0.01 * np.abs(torque).max())
+
+
+def test_references_and_positions_are_two_parts_of_one_torque():
+    expected = ExpectedTorque([drive(GOOD)] * 2, STEP)
+    targets = np.array([[1e-3] * 3 + [0.0], [0.0] * 4])
+    parts = np.array([expected.advance(targets, np.full((2, 4), 1e-3)) for _ in range(20)])
+    rises = np.diff(parts[-2:], axis=0)[0]
+    assert rises[0, 0] == pytest.approx(-rises[1, 0], rel=1e-6), "it stands at its target"
+    assert rises[0, 0] == pytest.approx(GOOD.velocity_i * GOOD.position_p * 1e-3 * STEP, rel=1e-6)
+    assert np.all(parts[:, 0, 1] == 0)
+
+
+def work(position, torque, rest=0.0):
+    one = WorkWatch(np.array([rest]), np.array([COUNT]), np.array([LIMIT]), ["rad"])
+    for n, (q, t) in enumerate(zip(position, torque, strict=True)):
+        found = one.take([q], [t], fresh=True)
+        if found:
+            return n, found[0][1]
+    return None
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    bandwidth=st.floats(15.0, 150.0),
+    friction=st.floats(0.0, 4.0),
+    part=st.floats(-1.0, 1.0),
+    noise=st.floats(0.0, 0.02),
+    spring=st.floats(3.0, 40.0),
+    seed=st.integers(0, 2**31),
+)
+def test_a_motor_that_pushes_the_right_way_does_no_negative_work(
+    bandwidth, friction, part, noise, spring, seed
+):
+    """Dry friction may have held any part of itself in what is taken for the torque at rest."""
+    loop = AxisLoop(bandwidth / 4, bandwidth * INERTIA, bandwidth**2 / 5 * INERTIA, 1.0, INERTIA)
+    target, _ = trial_path(loop)
+    stiffness = 0.4 * INERTIA * (2 * np.pi * spring) ** 2
+    axis = Axis(loop, friction=friction, spring=stiffness)
+    position, torque = axis.run(target, noise * LIMIT, seed)
+    assert work(position, torque, 0.98 * part * friction) is None
+
+
+@pytest.mark.parametrize("bandwidth", [12.0, 40.0, 120.0])
+def test_a_motor_that_pushes_the_wrong_way_is_found_while_its_torque_is_small(bandwidth):
+    loop = AxisLoop(bandwidth / 4, bandwidth * INERTIA, bandwidth**2 / 5 * INERTIA, 1.0, INERTIA)
+    target, _ = trial_path(loop)
+    position, torque = Axis(loop, sign=-1.0).run(target, 0.02, 5)
+    found = work(position, torque)
+    assert found is not None
+    row, text = found
+    assert "against its own torque" in text
+    assert np.abs(torque[:row]).max() < 0.3 * LIMIT
