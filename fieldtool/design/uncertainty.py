@@ -2,13 +2,13 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
-from math import isfinite
+from math import exp, isfinite, sqrt
 from typing import Any
 
 import numpy as np
 
 from fieldtool.design.machine import spring_of
-from fieldtool.records.model import AxisModel, Coupling, Estimate, MachineModel
+from fieldtool.records.model import Correlation, Estimate, MachineModel
 
 FURTHEST = 2.5
 """Standard errors beyond which nothing is drawn."""
@@ -26,9 +26,9 @@ TRIES = 50
 def samples_of(model: MachineModel, count: int, rng: np.random.Generator) -> list[MachineModel]:
     """Return ``count`` models drawn from a model's standard errors.
 
+    Errors hang together as the model's correlation says, and are independent where it says nothing.
     Masses and springs are drawn in their logarithm, so that none becomes negative; couplings so
-    that the mass matrix stays positive definite.  Errors are taken as independent, which is on the
-    safe side: the model does not keep their covariance.
+    that the mass matrix stays positive definite.
     """
     return [_drawn(model, rng) for _ in range(count)]
 
@@ -66,41 +66,44 @@ def _with_spring(model: MachineModel, effect: Mapping[str, Any], factor: float) 
 
 def _drawn(model: MachineModel, rng: np.random.Generator) -> MachineModel:
     for _ in range(TRIES):
-        drawn = replace(
-            model,
-            axes=tuple(_axis(axis, rng) for axis in model.axes),
-            couplings=tuple(_coupling(c, rng) for c in model.couplings),
-        )
+        drawn = model.with_numbers(_numbers(model, rng))
         if np.linalg.eigvalsh(drawn.mass_matrix)[0] > 0:
             return drawn
     return model
 
 
-def _axis(axis: AxisModel, rng: np.random.Generator) -> AxisModel:
-    def scaled(values: tuple[Estimate, ...], least: float, unknown: float) -> tuple[Estimate, ...]:
-        return tuple(_scaled(one, least, unknown, rng) for one in values)
-
-    return replace(
-        axis,
-        masses=scaled(axis.masses, LEAST_MASS, UNKNOWN_MASS),
-        springs=scaled(axis.springs, LEAST_SPRING, UNKNOWN_SPRING),
-        dampers=scaled(axis.dampers, LEAST_DAMPER, UNKNOWN_DAMPER),
-        viscous_friction=_scaled(axis.viscous_friction, LEAST_DAMPER, UNKNOWN_DAMPER, rng),
-        load_friction=_scaled(axis.load_friction, LEAST_DAMPER, UNKNOWN_DAMPER, rng),
-    )
-
-
-def _scaled(one: Estimate, least: float, unknown: float, rng: np.random.Generator) -> Estimate:
-    if one.value == 0.0:
-        return one
-    relative = max(one.std / abs(one.value), least) if isfinite(one.std) else unknown
-    return replace(one, value=one.value * float(np.exp(relative * _normal(rng))))
+def _numbers(model: MachineModel, rng: np.random.Generator) -> dict[str, Estimate]:
+    """Draw every number of a model; those that are 0 stay."""
+    numbers = {name: one for name, one in model.numbers.items() if one.value != 0.0}
+    normal = {name: _normal(rng) for name in numbers}
+    if model.correlation is not None:
+        normal |= _together(model.correlation, rng)
+    out = {}
+    for name, one in numbers.items():
+        least, unknown = _floors(name)
+        known = one.std / abs(one.value) if isfinite(one.std) else unknown
+        besides = sqrt(max(least**2 - known**2, 0.0))
+        off = known * normal[name] + besides * _normal(rng)
+        factor = 1 + off if name.startswith("coupling") else exp(off)
+        out[name] = replace(one, value=one.value * factor)
+    return out
 
 
-def _coupling(one: Coupling, rng: np.random.Generator) -> Coupling:
-    std = one.std if isfinite(one.std) else UNKNOWN_MASS * abs(one.value)
-    std = max(std, LEAST_MASS * abs(one.value))
-    return replace(one, value=one.value + std * _normal(rng))
+def _floors(name: str) -> tuple[float, float]:
+    """Return the least relative error of a number, and that where the model does not tell."""
+    if ".spring[" in name:
+        return LEAST_SPRING, UNKNOWN_SPRING
+    if ".mass[" in name or name.startswith("coupling"):
+        return LEAST_MASS, UNKNOWN_MASS
+    return LEAST_DAMPER, UNKNOWN_DAMPER
+
+
+def _together(correlation: Correlation, rng: np.random.Generator) -> dict[str, float]:
+    """Draw normal numbers with these correlations."""
+    values, vectors = np.linalg.eigh(correlation.matrix)
+    roots = np.sqrt(np.maximum(values, 0.0))  # rounded numbers may leave it a little below 0
+    drawn = vectors @ (roots * np.array([_normal(rng) for _ in values]))
+    return dict(zip(correlation.names, drawn.tolist(), strict=True))
 
 
 def _normal(rng: np.random.Generator) -> float:

@@ -13,8 +13,11 @@ from fieldtool.identify.classic import identify_classic
 from fieldtool.identify.likelihood.refine import RefinedModel
 from fieldtool.identify.moves.identify import identify_moves
 from fieldtool.identify.multisine.identify import effect_entry, identify_joint
-from fieldtool.records.model import Estimate, FloatArray, Kind, MachineModel
+from fieldtool.records.model import Correlation, Estimate, FloatArray, Kind, MachineModel
 from fieldtool.records.recording import Recording
+
+DECIMALS = 6
+"""Of correlations."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,6 +79,35 @@ def identify_recording(
         for axis in recording.axes
         if (count := masses.get(axis.name, axis.masses)) is not None
     }
+    return _correlated(_identified(recording, known, prior, motor_masses))
+
+
+def _correlated(found: Identified) -> Identified:
+    """Keep with the model how its errors hang together, where a fit tells."""
+    fitted = found.fitted
+    if fitted is None:
+        return found
+    variance, numbers = np.diag(fitted.covariance), found.model.numbers
+    told = [
+        k
+        for k, name in enumerate(fitted.names)
+        if name in numbers and np.isfinite(variance[k]) and variance[k] > 0
+    ]
+    matrix = fitted.covariance[np.ix_(told, told)]
+    matrix = np.clip(matrix / np.sqrt(np.outer(variance[told], variance[told])), -1.0, 1.0)
+    rows = tuple(
+        tuple(round(float(v), DECIMALS) for v in row[: k + 1]) for k, row in enumerate(matrix)
+    )
+    correlation = Correlation(tuple(fitted.names[k] for k in told), rows)
+    return replace(found, model=replace(found.model, correlation=correlation))
+
+
+def _identified(
+    recording: Recording,
+    known: Mapping[str, int],
+    prior: MachineModel | None,
+    motor_masses: Mapping[str, Estimate] | None,
+) -> Identified:
     kinds_of_data = {e.kind for e in recording.experiments if e.complete}
     if "stepped_sine" in kinds_of_data:
         return _classic(recording, known, prior, motor_masses)

@@ -10,7 +10,7 @@ N m s/rad on rotary ones.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import isfinite, nan
 from typing import Any, Literal
 
@@ -78,6 +78,31 @@ class Coupling:
 
 
 @dataclass(frozen=True)
+class Correlation:
+    """How the errors of a model's numbers hang together."""
+
+    names: tuple[str, ...]
+    """``x.mass[1]``, ``x.spring[1]``, ``x.damper[1]`` (motor side first), ``x.viscous_friction``,
+    ``x.load_friction``, ``coupling[x,y]``."""
+    rows: tuple[tuple[float, ...], ...]
+    """Lower triangle: row k has k + 1 numbers, its last one is 1."""
+
+    def __post_init__(self) -> None:
+        if [len(row) for row in self.rows] != list(range(1, len(self.names) + 1)):
+            raise ValueError("correlation needs one row a name, of 1, 2, 3 ... numbers")
+        if any(abs(number) > 1 for row in self.rows for number in row):
+            raise ValueError("correlation has a number outside of -1 to 1")
+
+    @property
+    def matrix(self) -> FloatArray:
+        """Symmetric, shape (P, P)."""
+        out = np.zeros((len(self.names),) * 2)
+        for k, row in enumerate(self.rows):
+            out[k, : k + 1] = out[: k + 1, k] = row
+        return out
+
+
+@dataclass(frozen=True)
 class MachineModel:
     """Chains and their couplings: what ``model.yaml`` holds."""
 
@@ -85,6 +110,8 @@ class MachineModel:
     couplings: tuple[Coupling, ...] = ()
     effects: tuple[Mapping[str, Any], ...] = field(default=())
     """Named additions, as ``model.yaml`` has them: effect, axis, parameters."""
+    correlation: Correlation | None = None
+    """Of the errors; None: not known."""
 
     def __post_init__(self) -> None:
         names = [axis.name for axis in self.axes]
@@ -94,6 +121,48 @@ class MachineModel:
             a, b = coupling.axes
             if a == b or a not in names or b not in names:
                 raise ValueError(f"coupling {a} - {b} does not join two axes of {names}")
+
+    @property
+    def numbers(self) -> dict[str, Estimate]:
+        """Masses, springs, dampers, viscous frictions and couplings by their names in a correlation."""
+        out: dict[str, Estimate] = {}
+        for axis in self.axes:
+            for what, chain in (
+                ("mass", axis.masses),
+                ("spring", axis.springs),
+                ("damper", axis.dampers),
+            ):
+                out |= {f"{axis.name}.{what}[{k + 1}]": one for k, one in enumerate(chain)}
+            out[f"{axis.name}.viscous_friction"] = axis.viscous_friction
+            out[f"{axis.name}.load_friction"] = axis.load_friction
+        for one in self.couplings:
+            out[f"coupling[{one.axes[0]},{one.axes[1]}]"] = Estimate(one.value, one.std)
+        return out
+
+    def with_numbers(self, new: Mapping[str, Estimate]) -> "MachineModel":
+        """Return the model with other numbers; those that are not named stay."""
+        known = self.numbers | dict(new)
+
+        def chain(axis: AxisModel, what: str, count: int) -> tuple[Estimate, ...]:
+            return tuple(known[f"{axis.name}.{what}[{k + 1}]"] for k in range(count))
+
+        axes = tuple(
+            replace(
+                axis,
+                masses=chain(axis, "mass", len(axis.masses)),
+                springs=chain(axis, "spring", len(axis.springs)),
+                dampers=chain(axis, "damper", len(axis.dampers)),
+                viscous_friction=known[f"{axis.name}.viscous_friction"],
+                load_friction=known[f"{axis.name}.load_friction"],
+            )
+            for axis in self.axes
+        )
+        coupled = [known[f"coupling[{c.axes[0]},{c.axes[1]}]"] for c in self.couplings]
+        couplings = tuple(
+            replace(c, value=one.value, std=one.std)
+            for c, one in zip(self.couplings, coupled, strict=True)
+        )
+        return replace(self, axes=axes, couplings=couplings)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -168,6 +237,7 @@ class MachineModel:
                 *(_friction(axis) for axis in self.axes if _has_friction(axis)),
                 *(dict(effect) for effect in self.effects),
             ],
+            **({} if self.correlation is None else {"correlation": _triangle(self.correlation)}),
         }
 
     @classmethod
@@ -186,7 +256,7 @@ class MachineModel:
 
     @classmethod
     def _from_dict(cls, data: Mapping[str, Any]) -> "MachineModel":
-        _only_keys(data, {"format", "axes", "couplings", "effects"}, "model")
+        _only_keys(data, {"format", "axes", "couplings", "effects", "correlation"}, "model")
         if data.get("format") != FORMAT:
             raise ValueError(f"format must be {FORMAT}, got {data.get('format')!r}")
         names = [str(axis["name"]) for axis in data["axes"]]
@@ -224,7 +294,25 @@ class MachineModel:
             a, b = coupling["axes"]
             e = _estimate({k: v for k, v in coupling.items() if k != "axes"})
             couplings.append(Coupling((str(a), str(b)), e.value, e.std))
-        return cls(tuple(axes), tuple(couplings), tuple(effects))
+        model = cls(tuple(axes), tuple(couplings), tuple(effects))
+        return replace(model, correlation=_correlation(data.get("correlation"), model))
+
+
+def _triangle(correlation: Correlation) -> dict[str, Any]:
+    return {"names": list(correlation.names), "rows": [list(row) for row in correlation.rows]}
+
+
+def _correlation(data: Any, model: MachineModel) -> Correlation | None:
+    if data is None:
+        return None
+    _only_keys(data, {"names", "rows"}, "correlation")
+    names = tuple(str(name) for name in data["names"])
+    unknown = set(names) - set(model.numbers)
+    if unknown or len(set(names)) != len(names):
+        raise ValueError(
+            f"correlation names {sorted(unknown) or 'a number twice'}; known are {sorted(model.numbers)}"
+        )
+    return Correlation(names, tuple(tuple(_number(n) for n in row) for row in data["rows"]))
 
 
 def _has_friction(axis: AxisModel) -> bool:

@@ -61,11 +61,17 @@ class _Effect(StrictModel):
     parameters: dict[str, _Parameter | Number]
 
 
+class _Correlation(StrictModel):
+    names: list[str]
+    rows: list[list[Number]]
+
+
 class _ModelFile(StrictModel):
     format: Literal["fieldtool-model/1"]
     axes: list[_Axis] = Field(min_length=1)
     couplings: list[_Coupling] | None = None
     effects: list[_Effect] | None = None
+    correlation: _Correlation | None = None
 
 
 def read_model(path: Path | str) -> MachineModel:

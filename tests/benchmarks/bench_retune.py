@@ -17,6 +17,8 @@ Rows are appended to a file (``--out``), so that pieces add up: the same seed go
 import argparse
 import json
 import os
+import re
+import shutil
 import tempfile
 import time
 from contextlib import ExitStack
@@ -35,7 +37,7 @@ from fieldtool import workflow
 from fieldtool.design.machine import machine_of
 from fieldtool.design.predict import predict
 from fieldtool.design.rule import rule
-from fieldtool.errors import FieldtoolError
+from fieldtool.errors import FieldtoolError, PlanRefusedError
 from fieldtool.records.closed_loop import AxisLoop, ClosedLoop
 from fieldtool.records.model import MachineModel
 from fieldtool.workflow import Options
@@ -44,7 +46,8 @@ from fieldtool.workflow.verifying import Verification
 
 CHANNEL = "bench-retune"
 SECONDS = 15.0
-"""Of excitation for the identification."""
+"""Of excitation for the identification; where the tool says that it needs more, it gets what it says."""
+MORE = re.compile(r"allow more time \(--time (\d+)\)")
 BOUND, SLOWER, PEAK_OFF, TIME_OFF, CYCLES = 2.1, 1.05, 0.10, 0.15, 3.0
 
 
@@ -181,12 +184,7 @@ def tried(seed: int, number: int, keep: Path | None = None) -> dict[str, Any]:
                 ):
                     stack.enter_context(patch(target, new))
                 stack.enter_context(patch.object(Verification, "plan", noted))
-                result = workflow.run(
-                    machine,
-                    folder / "session",
-                    Options(write=True, excitation_time=SECONDS),
-                    confirm=lambda _: True,
-                )
+                result = _run(machine, folder / "session")
             row["outcome"] = "kept"
             row["time"] = result.machine_time
         except (DrivesError, FieldtoolError) as error:
@@ -202,6 +200,25 @@ def tried(seed: int, number: int, keep: Path | None = None) -> dict[str, Any]:
         if plans:
             row["true"] = _true_figures(truth_model(machine), plans[-1])
     return row
+
+
+def _run(machine: MachineProfile, folder: Path) -> workflow.SessionResult:
+    """Run a session; once more with the time that the tool asks for, as a person would."""
+    seconds = SECONDS
+    while True:
+        try:
+            return workflow.run(
+                machine,
+                folder,
+                Options(write=True, excitation_time=seconds),
+                confirm=lambda _: True,
+            )
+        except PlanRefusedError as error:
+            asked = MORE.search(str(error))
+            if asked is None or float(asked[1]) <= seconds:
+                raise
+            seconds = float(asked[1])
+            shutil.rmtree(folder)
 
 
 def _uncriticised(_session: Any, model: MachineModel, *_: Any) -> tuple[MachineModel, None]:

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fieldtool.records.model import AxisModel, Coupling, Estimate, Kind, MachineModel
+from fieldtool.records.model import AxisModel, Correlation, Coupling, Estimate, Kind, MachineModel
 
 RandomModel = Callable[..., MachineModel]
 
@@ -121,7 +121,13 @@ def machines(draw: st.DrawFn) -> MachineModel:
         axes.append(AxisModel(f"x{k}", kind, tuple(masses), tuple(draw(few)), dampers, *frictions))
     pairs = [(f"x{i}", f"x{j}") for i in range(len(axes)) for j in range(i)]
     couplings = [Coupling(pair, draw(numbers), draw(st.floats(0, 1e9))) for pair in pairs]
-    return MachineModel(tuple(axes), tuple(couplings), tuple(draw(st.lists(effects, max_size=2))))
+    model = MachineModel(tuple(axes), tuple(couplings), tuple(draw(st.lists(effects, max_size=2))))
+    names = draw(st.lists(st.sampled_from(sorted(model.numbers)), unique=True, max_size=3))
+    if not names:
+        return model
+    shares = st.floats(-1.0, 1.0)
+    rows = tuple((*draw(st.tuples(*[shares] * k)), 1.0) for k in range(len(names)))
+    return replace(model, correlation=Correlation(tuple(names), rows))
 
 
 @given(machines())
@@ -133,6 +139,17 @@ def test_models_survive_json(model: MachineModel) -> None:
     for one, other in zip(again.axes, model.axes, strict=True):
         assert one.masses[0].value == other.masses[0].value
         assert isnan(one.masses[0].std) == isnan(other.masses[0].std)
+
+
+@given(machines())
+def test_numbers_have_names_and_come_back(model: MachineModel) -> None:
+    assert repr(model.with_numbers({})) == repr(model)
+    name = sorted(model.numbers)[-1]
+    changed = model.with_numbers({name: Estimate(0.125, 0.5)})
+    assert changed.numbers[name] == Estimate(0.125, 0.5)
+    assert {k: repr(v) for k, v in changed.numbers.items() if k != name} == {
+        k: repr(v) for k, v in model.numbers.items() if k != name
+    }
 
 
 def test_plain_numbers_and_missing_parts() -> None:
@@ -192,6 +209,14 @@ AXIS: dict[str, Any] = {"name": "x", "kind": "rotary", "masses": [1], "springs":
             "viscous friction is on axis 'y'",
         ),
         (changed(effects=[{"effect": "viscous_friction", "axis": "x"}]), "'parameters' is missing"),
+        (changed(correlation={"names": ["x.mass[1]"]}), "'rows' is missing"),
+        (
+            changed(correlation={"names": ["x.mass[2]"], "rows": [[1.0]]}),
+            r"names \['x.mass\[2\]'\]",
+        ),
+        (changed(correlation={"names": ["x.mass[1]"], "rows": [[1.0, 0]]}), "one row a name"),
+        (changed(correlation={"names": ["x.mass[1]"] * 2, "rows": [[1], [0, 1]]}), "number twice"),
+        (changed(correlation={"names": ["x.mass[1]"], "rows": [[1.5]]}), "outside of -1 to 1"),
     ],
 )
 def test_what_is_no_model_is_refused(data: dict[str, Any], words: str) -> None:
