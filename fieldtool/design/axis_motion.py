@@ -55,7 +55,8 @@ class AxisMotion:
         gains = without(np.stack([servo.gain(s) for servo in servos], axis=-1), axis)
         closed = closed_compliance(grids.slow, gains)
         loads = grids.loads - np.einsum("wij,wj,wjk->wik", grids.loads, gains, closed)
-        self._motor, self._load = closed[:, axis, axis], loads[:, axis, axis]
+        self._motor = closed[:, axis, axis]
+        self._plants = np.stack([self._motor, loads[:, axis, axis]])
         self._target = wave.spectrum(wave.move(self.move))
         self._step = wave.spectrum(wave.step(DISTURBANCE * self.mass * self.move.acceleration))
         self._wanted = wave.move(self.move)
@@ -63,19 +64,22 @@ class AxisMotion:
         self._begin = int(np.searchsorted(wave.time, self.move.duration))
         self._weight = np.where(wave.time >= self.move.duration, 1.0, DURING)
         # position = there - back C S, for motor and last mass of every other axis on its own move
-        self._others = []
+        self._others, there, back = [], [], []
         for i in others:
             wanted = wave.move(moves[i])
             drive = servos[i].reference_gain(s) * wave.spectrum(wanted)
             begin = int(np.searchsorted(wave.time, moves[i].duration))
-            band = INNER_BAND * moves[i].settling_band
             for what in (closed, loads):
-                there, back = what[:, i, i] * drive, what[:, i, axis] * closed[:, axis, i] * drive
-                self._others.append((there, back, wanted[begin:], begin, band))
+                there.append(what[:, i, i] * drive)
+                back.append(what[:, i, axis] * closed[:, axis, i] * drive)
+                self._others.append((wanted[begin:], begin, INNER_BAND * moves[i].settling_band))
+        shape = (len(there), wave.omega.size)
+        self._there = np.array(there, dtype=np.complex128).reshape(shape)
+        self._back = np.array(back, dtype=np.complex128).reshape(shape)
 
     def _dragged(
         self, grids: Grids, wave: HalfWave, inner: tuple[int, ComplexArray, ComplexArray]
-    ) -> tuple[ComplexArray, ComplexArray] | None:
+    ) -> ComplexArray | None:
         """Return what the axis' dry friction does to motor and last mass before its loop is closed.
 
         As a torque against the direction of the reference's velocity: what an integrator has to learn
@@ -92,7 +96,7 @@ class AxisMotion:
             return None
         moving = np.sign(np.round(self.move.at(wave.time)[1] / self.move.velocity, 9))
         force = wave.spectrum(-torque * moving)
-        return closed[:, axis, axis] * force, loads[:, axis, axis] * force
+        return np.stack([closed[:, axis, axis] * force, loads[:, axis, axis] * force])
 
     def fed_forward(self, servo: Servo) -> Servo:
         """Return a controller with the feed-forward that fits its feedback best."""
@@ -103,8 +107,8 @@ class AxisMotion:
 
     def _feed_forward(
         self, servo: Servo, sensitivity: ComplexArray, torque: ComplexArray, pi: ComplexArray
-    ) -> tuple[tuple[float, float], tuple[FloatArray, FloatArray], ComplexArray]:
-        """Return the shares, errors of motor and last mass on the move, and the torque's phasors.
+    ) -> tuple[tuple[float, float], FloatArray, ComplexArray]:
+        """Return the shares, errors of motor and last mass on the move (2, N), and the torque's phasors.
 
         Shares are those of least squares over the time after the move, and a little before it.
         """
@@ -112,21 +116,17 @@ class AxisMotion:
         parts = [pi * servo.loop.position_p * drive]
         parts.append(pi * self._slow.s * drive)
         parts.append(torque * self._slow.acceleration * drive * self.mass)
-        signals = [[wave.signal(plant * part) for part in parts] for plant in self._plants]
+        spectra = self._plants[:, None, :] * np.stack(parts)
         if self._drag is not None:
-            for one, dragged in zip(signals, self._drag, strict=True):
-                one[0] = one[0] + wave.signal(dragged * sensitivity)
+            spectra[:, 0] += self._drag * sensitivity
+        signals = wave.signal(spectra)
+        signals[:, 0] -= self._wanted
+        seen = signals * self._weight
         known = np.array([servo.loop.velocity_ff, servo.loop.inertia_ff / self.mass])
-        base = np.concatenate([(one[0] - self._wanted) * self._weight for one in signals])
-        columns = np.column_stack(
-            [np.concatenate([one[k] * self._weight for one in signals]) for k in (1, 2)]
-        )
-        best = _least_squares(columns, base, known, np.array(self.free), self._most_fed(servo))
-        errors = tuple(
-            one[0] - self._wanted + best[0] * one[1] + best[1] * one[2] for one in signals
-        )
+        best = _least_squares(seen, known, np.array(self.free), self._most_fed(servo))
+        errors = signals[:, 0] + best[0] * signals[:, 1] + best[1] * signals[:, 2]
         phasors = parts[0] + best[0] * parts[1] + best[1] * parts[2]
-        return (float(best[0]), float(best[1]) * self.mass), (errors[0], errors[1]), phasors
+        return (float(best[0]), float(best[1]) * self.mass), errors, phasors
 
     def _most_fed(self, servo: Servo) -> FloatArray:
         """Return the largest shares of velocity and inertia: targets are rounded to encoder steps."""
@@ -136,49 +136,46 @@ class AxisMotion:
             return MOST_FED
         return np.asarray(np.minimum(MOST_FED, [1.0, FED_NOISE * self.bounds.noise / noise]))
 
-    @property
-    def _plants(self) -> tuple[ComplexArray, ComplexArray]:
-        return self._motor, self._load
-
     def figures(self, servo: Servo) -> tuple[float, float]:
         """Return a smooth measure of the time outside of the band, s, and the move's largest torque."""
         gain, torque, pi = self._slow.gain(servo)
         wave, sensitivity = self._wave, 1 / (1 + gain * self._motor)
         _, errors, phasors = self._feed_forward(servo, sensitivity, torque, pi)
         band = INNER_BAND * self.move.settling_band
-        disturbed = self._step * sensitivity
-        total = 0.0
-        for plant, error in zip(self._plants, errors, strict=True):
-            pushed = wave.signal(plant * disturbed)
-            total += MOVED * _outside(error[self._begin :], band)
-            energy = float(pushed @ pushed) * self._tick / band**2
-            total += STIFFNESS * self.move.duration / self._tick * float(np.log(energy + 1e-12))
+        count = MOVED * _outside(errors[:, self._begin :], band)
         follow = gain * sensitivity
-        for there, back, wanted, begin, other_band in self._others:
-            moved = wave.signal(there - back * follow)[begin:]
-            total += _outside(moved - wanted, other_band)
+        spectra = np.concatenate(
+            [self._plants * (self._step * sensitivity), self._there - self._back * follow]
+        )
+        moved = wave.signal(spectra)
+        energies = (moved[:2] ** 2).sum(axis=1) * self._tick / band**2
+        total = count + STIFFNESS * self.move.duration / self._tick * float(
+            np.log(energies + 1e-12).sum()
+        )
+        for signal, (wanted, begin, other_band) in zip(moved[2:], self._others, strict=True):
+            total += _outside(signal[begin:] - wanted, other_band)
         return 0.5 * self._tick * total, float(np.abs(wave.signal(phasors)).max())
 
 
 def _least_squares(
-    columns: FloatArray,
-    base: FloatArray,
-    known: FloatArray,
-    free: NDArray[np.bool_],
-    most: FloatArray,
+    seen: FloatArray, known: FloatArray, free: NDArray[np.bool_], most: FloatArray
 ) -> FloatArray:
-    """Return shares within their bounds that make base + columns shares smallest; fixed ones stay."""
+    """Return shares within their bounds that make base + columns shares smallest; fixed ones stay.
+
+    Parameters
+    ----------
+    seen
+        Base and two columns of two signals, shape (2, 3, N).
+    """
+    products = np.einsum("pin,pjn->ij", seen, seen)
+    normal, base = products[1:, 1:], products[1:, 0]
     best = np.where(free, np.clip(known, 0.0, most), known)
     for k in (0, 1, 0, 1) if free.all() else (0, 1):
         if free[k]:
-            column = columns[:, k]
-            rest = base + columns @ best - column * best[k]
-            size = float(column @ column)
-            best[k] = float(np.clip(-(column @ rest) / max(size, 1e-300), 0.0, most[k]))
+            rest = base[k] + normal[k] @ best - normal[k, k] * best[k]
+            best[k] = float(np.clip(-rest / max(float(normal[k, k]), 1e-300), 0.0, most[k]))
     if free.all():
-        normal = columns.T @ columns
-        normal += 1e-12 * np.trace(normal) * np.eye(2)
-        pair = np.linalg.solve(normal, -(columns.T @ base))
+        pair = np.linalg.solve(normal + 1e-12 * np.trace(normal) * np.eye(2), -base)
         if np.all((pair >= 0) & (pair <= most)):
             return np.asarray(pair)
     return best

@@ -42,7 +42,7 @@ class HalfWave:
         return np.fft.fft(signal * np.conj(self._twist))[: self.samples // 2]
 
     def signal(self, spectrum: ComplexArray) -> FloatArray:
-        """Return the signal of phasors, shape (N / 2,) or fewer (the others are 0), as shape (N,)."""
+        """Return the signal of phasors, shape (..., N / 2) or fewer (the others are 0), as (..., N)."""
         twisted = np.fft.ifft(spectrum, self.samples)
         twisted *= self._twist
         return np.asarray(2 * twisted.real)
