@@ -8,8 +8,8 @@ thumb (``fieldtool.design.rule``) for the old tooling.
 What is wanted: stable in all; measured peak of sensitivity at most 2.1; settling shorter than before in
 at least 90 % of the axes, never more than 5 % longer where the tool kept the parameters; prediction
 against measurement within 10 % (peak) and 15 % (settling, to 3 cycles).  The true model's own figures
-for what was written stand beside.  Left out: criticism and report, which take their time and change
-nothing here.
+for what was written stand beside.  Left out: criticism, report and pictures, which take their time and
+change nothing here.
 
 Rows are appended to a file (``--out``), so that pieces add up: the same seed goes on where it ended.
 """
@@ -181,6 +181,8 @@ def tried(seed: int, number: int, keep: Path | None = None) -> dict[str, Any]:
                     ("fieldtool.workflow.stages.criticised", _uncriticised),
                     ("fieldtool.workflow.stages._reported", lambda *_: None),
                     ("fieldtool.workflow.stages.report", lambda *_: None),
+                    ("fieldtool.workflow.stages.draw_responses", lambda *_: None),
+                    ("fieldtool.workflow.verifying.draw_verification", lambda *_: None),
                 ):
                     stack.enter_context(patch(target, new))
                 stack.enter_context(patch.object(Verification, "plan", noted))
