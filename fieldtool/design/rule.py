@@ -19,7 +19,7 @@ import numpy as np
 from scipy.linalg import eigh
 
 from fieldtool.errors import FieldtoolError
-from fieldtool.records.closed_loop import AxisLoop, Biquad, ClosedLoop
+from fieldtool.records.closed_loop import AxisLoop, ClosedLoop
 from fieldtool.records.model import AxisModel, FloatArray, MachineModel
 
 BANDWIDTH_SHARE = 0.7
@@ -29,7 +29,6 @@ RATIO = 4.0
 SENSITIVITY_BOUND = 2.0
 LOWERED = 0.85
 MAX_STEPS = 25
-NOTCH_ZERO_DAMPING, NOTCH_POLE_DAMPING = 0.1, 0.5
 GRID = 500
 
 
@@ -38,7 +37,7 @@ class DesignError(FieldtoolError):
 
 
 def rule(model: MachineModel) -> list[AxisLoop]:
-    """Return the rule's loops without filters, one an axis, lowered until the margin is kept.
+    """Return the rule's loops, one an axis, lowered until the margin is kept.
 
     Raises
     ------
@@ -47,20 +46,6 @@ def rule(model: MachineModel) -> list[AxisLoop]:
     """
     check_masses(model)
     return _within_bound(model, [_rule(axis) for axis in model.axes])
-
-
-def rule_with_notches(model: MachineModel) -> list[AxisLoop]:
-    """Return the rule's loops with a notch at each axis' dominating resonance, where the margin allows.
-
-    Raises
-    ------
-    DesignError
-        As :func:`rule`.
-    """
-    loops = rule(model)
-    for k in range(len(loops)):
-        loops = _with_notch(model, loops, k)
-    return loops
 
 
 def sensitivity_peak(model: MachineModel, loops: list[AxisLoop], axis: int) -> float:
@@ -124,33 +109,6 @@ def _slower(loop: AxisLoop) -> AxisLoop:
         velocity_p=loop.velocity_p * LOWERED,
         velocity_i=loop.velocity_i * LOWERED**2,
     )
-
-
-def _with_notch(model: MachineModel, loops: list[AxisLoop], k: int) -> list[AxisLoop]:
-    """Put a notch at the resonance that dominates the axis' response, if the margin allows it."""
-    resonance = dominating_resonance(model, k)
-    if resonance is None:
-        return loops
-    notch = Biquad.notch(resonance / (2 * np.pi), NOTCH_ZERO_DAMPING, NOTCH_POLE_DAMPING)
-    tried = list(loops)
-    tried[k] = replace(loops[k], filters=(notch,))
-    if not ClosedLoop(model, tuple(tried)).stable:
-        return loops
-    peaks = [sensitivity_peak(model, tried, i) for i in range(len(loops))]
-    return tried if max(peaks) <= SENSITIVITY_BOUND else loops
-
-
-def dominating_resonance(model: MachineModel, k: int) -> float | None:
-    """Return the resonance with the largest share in the axis' response to torque, rad/s."""
-    values, shapes = eigh(model.stiffness_matrix, model.mass_matrix)
-    motor = model.first_masses[k]
-    elastic = values > 1e-9 * max(float(values[-1]), 1e-300)
-    if not elastic.any():
-        return None
-    share = np.where(elastic, shapes[motor] ** 2, 0.0)
-    if share.max() < 1e-12 * np.sum(shapes[motor] ** 2):
-        return None  # a rigid axis, not coupled: the machine's resonances are not its own
-    return float(np.sqrt(values[int(np.argmax(share))]))
 
 
 def _grid(model: MachineModel) -> FloatArray:
