@@ -2,20 +2,21 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import inf
+from math import inf, isfinite
 
 import numpy as np
 
-from fieldtool.design.design import Advance, Softer, Task, default_moves, find
+from fieldtool.design.design import Advance, Softer, Task, find
 from fieldtool.design.drive_side import DriveSide
+from fieldtool.design.held import held
 from fieldtool.design.loops import Loops, system_matrix
-from fieldtool.design.machine import Machine, respond
+from fieldtool.design.machine import Machine, machine_of, respond
 from fieldtool.design.margins import margins_of
-from fieldtool.design.moves import TestMove
+from fieldtool.design.moves import TestMove, typical_move
 from fieldtool.design.no_worse import no_worse, predicted
 from fieldtool.design.nonlinear import notes_of
 from fieldtool.design.predict import Prediction, frequencies
-from fieldtool.design.robust import SLACK, check
+from fieldtool.design.robust import SLACK
 from fieldtool.design.rule import DesignError, check_masses, lowest_antiresonance
 from fieldtool.design.search import slots_of
 from fieldtool.design.servo import Servo
@@ -36,6 +37,8 @@ TRADE = (0.25, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0)
 SEED = 20
 NARROWER = 0.99
 """Times the bandwidth of a softer response that one has at least."""
+SOFTEST = min(RESPONSES, key=RESPONSES.__getitem__)
+"""The response that is chosen because the machine is too lively as it is."""
 KEPT = "nothing better than the present parameters was found: they are kept."
 SWINGS = 0.25
 """Damping ratio below which a vibration is left to shape."""
@@ -106,7 +109,9 @@ def design(
 
         room = 1 + (bound - 1) * RESPONSES[name]
         try:
-            result = _at(find(model, sides, moves, room, limit, seed, part, softer))
+            task = find(model, sides, moves, room, limit, seed, part, softer)
+            task.most = room if name == SOFTEST else bound
+            result = _at(task)
         except DesignError:
             if name == response:
                 raise
@@ -115,6 +120,18 @@ def design(
             result.servos, tuple(axis.margins.bandwidth for axis in result.prediction.axes)
         )
     return _tuning(result, response)
+
+
+def default_moves(model: MachineModel, sides: Sequence[DriveSide]) -> tuple[TestMove, ...]:
+    """Return moves for a model alone: a radian in some periods of its lowest mode."""
+    modes = machine_of(model).modes
+    w = float(modes[0]) if modes.size else 20.0
+    moves = []
+    for axis, side in zip(model.axes, sides, strict=True):
+        torque = side.torque_limit if isfinite(side.torque_limit) else inf
+        fast = typical_move(axis.name, (0.0, 1.0), 2.0 * w, 0.2 * w * w, torque, axis.total_mass)
+        moves.append(fast)
+    return tuple(moves)
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,11 +155,8 @@ def _at(task: Task) -> _Result:
         As :func:`design`.
     """
     task.advance("round, check and predict", 0.95)
-    chosen, kept = _rounded(task), frozenset[int]()
-    if task.present is not None:
-        chosen, kept = no_worse(task, chosen, task.present, _rounded)
-    prediction = predicted(task, chosen)
-    softer = task.softer
+    chosen, kept = no_worse(task, *held(task))
+    prediction, softer = predicted(task, chosen), task.softer
     if softer is not None and any(
         axis.margins.bandwidth < NARROWER * width
         for axis, width in zip(prediction.axes, softer.bandwidths, strict=True)
@@ -156,41 +170,6 @@ def _same(task: Task, softer: Softer) -> frozenset[int]:
     present = task.present or ()
     pairs = enumerate(zip(softer.servos, present, strict=False))
     return frozenset(k for k, (one, now) in pairs if one == now)
-
-
-def _rounded(task: Task) -> tuple[Servo, ...]:
-    """Return the controllers as the drives will hold them, within the margin on every machine.
-
-    Raises
-    ------
-    DesignError
-        If rounding or ranges do not leave it.
-    """
-    servos = task.servos
-    for _ in range(6):
-        parameters = [
-            as_parameters(servo, side) for servo, side in zip(servos, task.sides, strict=True)
-        ]
-        held = tuple(
-            side.servo(side.held(one)) for side, one in zip(task.sides, parameters, strict=True)
-        )
-        peaks = check(task.machines, held).peaks.max(axis=0)
-        if np.all(peaks <= SLACK * task.bound):
-            return held
-        servos = tuple(
-            slower(servo) if peak > SLACK * task.bound else servo
-            for servo, peak in zip(servos, peaks, strict=True)
-        )
-    k = int(np.argmax(peaks))
-    outside = task.sides[k].out_of_range(parameters[k])
-    why = (
-        f"its ranges are too small: {', '.join(outside)}" if outside else "its steps are too coarse"
-    )
-    raise DesignError(
-        f"{task.sides[k].axis}: with the numbers that the drive can hold, the peak of sensitivity is "
-        f"{peaks[k]:.3g}, above {task.bound:.3g}; {why}. Nothing is written. Choose other units or "
-        "ranges in the drive, allow more with --bound, or enter gains by hand."
-    )
 
 
 def _tuning(result: _Result, response: str) -> Tuning:
@@ -221,10 +200,11 @@ def _tuning(result: _Result, response: str) -> Tuning:
             f"The peak of sensitivity may be up to {task.bound:.3g} here, above {BOUND:g}: these "
             "parameters may be tried on the machine, and are never stored."
         )
+    peaks = [prediction.axes[k].margins.sensitivity_peak for k in kept]
     return Tuning(
         tuple(axes),
         response,
-        task.bound,
+        task.most if max(peaks, default=0.0) > SLACK * task.bound else task.bound,
         task.moves,
         prediction,
         predicted(task, task.present, spread=False) if task.present else None,

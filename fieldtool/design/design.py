@@ -9,7 +9,7 @@
 4. Round to what the drives hold, check again, predict, and compare with the present parameters.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
 from math import inf, isfinite
 
@@ -19,16 +19,24 @@ from fieldtool.design.axis_problem import UNSTABLE, AxisProblem
 from fieldtool.design.drive_side import DriveSide
 from fieldtool.design.grids import FAR_GAIN, Bounds, Grids, grids_of
 from fieldtool.design.loops import Loops, system_matrix
-from fieldtool.design.machine import Machine, machine_of, respond
-from fieldtool.design.moves import TestMove, typical_move
+from fieldtool.design.machine import Machine, respond
+from fieldtool.design.moves import TestMove
 from fieldtool.design.predict import frequencies
-from fieldtool.design.robust import FRESH, MAY_FAIL, check, fresh_check, machines_for, stable_on_all
+from fieldtool.design.robust import (
+    FRESH,
+    MAY_FAIL,
+    SLACK,
+    check,
+    fresh_check,
+    machines_for,
+    stable_on_all,
+)
 from fieldtool.design.rule import DesignError
 from fieldtool.design.search import Best, again, pruned, refined, search, slots_of
 from fieldtool.design.servo import Servo
 from fieldtool.design.start import MOST_LOWERED, plain_start, slower
 from fieldtool.design.waves import HalfWave
-from fieldtool.records.model import MachineModel
+from fieldtool.records.model import FloatArray, MachineModel
 
 NOISE_SHARE = 0.01
 """Of the torque limit: what the encoder's steps may make."""
@@ -81,6 +89,8 @@ class Task:
     rng: np.random.Generator
     advance: Advance
     softer: Softer | None = None
+    most: float = 0.0
+    """Bound of an axis that keeps its present parameters, for nothing else is as fast."""
     plain: tuple[Best, ...] = ()
     """The rule's controllers, without filters: where a search for structure begins."""
     found: list[Best] = field(default_factory=list)
@@ -105,6 +115,17 @@ class Task:
             for best, servo, side in zip(self.plain, servos, self.sides, strict=True)
         ]
 
+    def limits(self, kept: Collection[int]) -> FloatArray:
+        """Return the peak of sensitivity that each axis may have on every machine, shape (M,)."""
+        kinds = [
+            max(self.most, self.bound) if k in kept else self.bound for k in range(len(self.sides))
+        ]
+        return SLACK * np.array(kinds)
+
+    def holds(self, servos: tuple[Servo, ...], kept: Collection[int]) -> bool:
+        """Return whether controllers keep these limits on every machine of the task."""
+        return bool(np.all(check(self.machines, servos).peaks <= self.limits(kept)))
+
     def bounds(self, axis: int) -> Bounds:
         """Return what one axis has to keep."""
         side, does = self.sides[axis], self.does[axis]
@@ -119,18 +140,6 @@ class Task:
             max(FAR_GAIN, does.far),
             tuple(2 * np.pi * width for width in widths),
         )
-
-
-def default_moves(model: MachineModel, sides: Sequence[DriveSide]) -> tuple[TestMove, ...]:
-    """Return moves for a model alone: a radian in some periods of its lowest mode."""
-    modes = machine_of(model).modes
-    w = float(modes[0]) if modes.size else 20.0
-    moves = []
-    for axis, side in zip(model.axes, sides, strict=True):
-        torque = side.torque_limit if isfinite(side.torque_limit) else inf
-        fast = typical_move(axis.name, (0.0, 1.0), 2.0 * w, 0.2 * w * w, torque, axis.total_mass)
-        moves.append(fast)
-    return tuple(moves)
 
 
 def find(

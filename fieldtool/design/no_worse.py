@@ -1,14 +1,14 @@
 """New parameters against those that the drives have: an axis that would be slower keeps its own."""
 
-from collections.abc import Callable
 from math import inf
 
 import numpy as np
 
 from fieldtool.design.design import Task, improved
+from fieldtool.design.held import held
 from fieldtool.design.machine import machine_of
 from fieldtool.design.predict import AxisPrediction, Prediction, predict
-from fieldtool.design.robust import SLACK, check, stable_on_all
+from fieldtool.design.robust import SLACK, stable_on_all
 from fieldtool.design.rule import DesignError
 from fieldtool.design.servo import Servo
 from fieldtool.design.uncertainty import samples_of
@@ -21,11 +21,10 @@ TICK = 0.002
 SPREAD_OF = 8
 """Machines that the prediction's spread is over."""
 SPREAD_SEED = 20
-Round = Callable[[Task], tuple[Servo, ...]]
 
 
 def no_worse(
-    task: Task, chosen: tuple[Servo, ...], present: tuple[Servo, ...], rounded: Round
+    task: Task, chosen: tuple[Servo, ...], kept: frozenset[int] = frozenset()
 ) -> tuple[tuple[Servo, ...], frozenset[int]]:
     """Return controllers of which none is slower than what its drive has, and the axes that keep theirs.
 
@@ -36,36 +35,37 @@ def no_worse(
     ----------
     task
         The task; its best controllers change where axes are designed anew.
-    chosen, present
-        New controllers as the drives hold them, and those that are in the drives.
-    rounded
-        What the drives hold of a task's best controllers.
+    chosen
+        New controllers as the drives hold them.
+    kept
+        Axes that keep their present controllers already.
 
     Raises
     ------
     DesignError
         If new parameters are slower, and the present ones do not keep the margin on all machines.
     """
-    old = predicted(task, present, spread=False)
-    if not old.stable:
-        return chosen, frozenset()
-    good = [axis.margins.sensitivity_peak <= SLACK * task.bound for axis in old.axes]
-    kept: frozenset[int] = frozenset()
+    present = task.present
+    old = None if present is None else predicted(task, present, spread=False)
+    if present is None or old is None or not old.stable:
+        return chosen, kept
+    good = [axis.margins.sensitivity_peak <= SLACK * task.most for axis in old.axes]
     while slower := _slower_axes(task, chosen, old, good, kept):
         kept |= slower
         mixed = tuple(present[k] if k in kept else one for k, one in enumerate(chosen))
-        if not holds(task, mixed):
-            mixed = _round_these(task, mixed, kept, rounded) or present
+        if not task.holds(mixed, kept):
+            mixed = _round_these(task, mixed, kept) or present
         if mixed == present:
-            if holds(task, present):
-                return present, frozenset(range(len(present)))
+            every = frozenset(range(len(present)))
+            if task.holds(present, every):
+                return present, every
             raise _worse(task, chosen, old, min(slower))
         chosen = mixed
     return chosen, kept
 
 
 def _round_these(
-    task: Task, mixed: tuple[Servo, ...], kept: frozenset[int], rounded: Round
+    task: Task, mixed: tuple[Servo, ...], kept: frozenset[int]
 ) -> tuple[Servo, ...] | None:
     """Design the other axes anew; None where that does not come out within the margin."""
     if len(kept) == len(mixed) or not stable_on_all(task.machines, mixed):
@@ -75,16 +75,9 @@ def _round_these(
         if axis not in kept:
             improved(task, axis)
     try:
-        found = rounded(task)
+        return held(task, kept)[0]
     except DesignError:
         return None
-    found = tuple(mixed[k] if k in kept else one for k, one in enumerate(found))
-    return found if holds(task, found) else None
-
-
-def holds(task: Task, servos: tuple[Servo, ...]) -> bool:
-    """Return whether controllers keep the margin on every machine of the task."""
-    return bool(np.all(check(task.machines, servos).peaks <= SLACK * task.bound))
 
 
 def _slower_axes(
@@ -107,7 +100,7 @@ def _worse(task: Task, servos: tuple[Servo, ...], old: Prediction, axis: int) ->
     return DesignError(
         f"{new.axis}: the new parameters would need {arrival(new):.3g} s for its typical move, the "
         f"present ones need {arrival(was):.3g} s with a peak of sensitivity of "
-        f"{was.margins.sensitivity_peak:.3g}, and do not keep {task.bound:.3g} on every machine that "
+        f"{was.margins.sensitivity_peak:.3g}, and do not keep {task.most:.3g} on every machine that "
         "the model allows; nothing is written. Keep the present ones, or try --response stiff."
     )
 

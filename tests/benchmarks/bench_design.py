@@ -2,9 +2,10 @@
 
 limit    against a global search (differential evolution, long, on the true machine itself, with the
          same structure and the same bounds): time until motor and last mass have arrived, bandwidth.
-peers    relay tuning (Ziegler-Nichols), symmetric optimum on the total inertia, and a shaper alone on
-         the old gains (as Klipper chooses it), beside the old gains and the design: settling, peak
-         of sensitivity, vibration after the move.
+peers    relay tuning (Ziegler-Nichols) and symmetric optimum on the total inertia, both told the true
+         machine and given its inertia to feed forward; the tool's rule of thumb; a shaper alone on the
+         old gains (as Klipper chooses it); beside the old gains and the design: settling, peak of
+         sensitivity, vibration after the move.
 random   machines whose tooling was changed, drives tuned for the old one, a model with errors: what
          the design does on the true machine.
 time     seconds for three axes.
@@ -14,6 +15,7 @@ All is judged on the true machine by frequency responses and eigenvalues; seeds 
 
 import argparse
 import time
+from dataclasses import replace
 
 import numpy as np
 from design_machines import RESOLUTION, TIMING, Case, case
@@ -23,7 +25,7 @@ from drives.profile import load_machine
 from fieldtool.design.decide import design, swing
 from fieldtool.design.machine import machine_of
 from fieldtool.design.predict import predict
-from fieldtool.design.rule import DesignError
+from fieldtool.design.rule import DesignError, rule
 from fieldtool.design.servo import Servo
 from fieldtool.workflow.models import truth_model
 
@@ -82,13 +84,24 @@ def limit(rng: np.random.Generator, machines: int, generations: int) -> None:
     )
 
 
+def fed(one: Case, servos: tuple[Servo, ...]) -> tuple[Servo, ...]:
+    """Return controllers with velocity and inertia fed forward, as the design's are."""
+    return tuple(
+        replace(s, loop=replace(s.loop, velocity_ff=1.0, inertia_ff=axis.total_mass))
+        for s, axis in zip(servos, one.true.axes, strict=True)
+    )
+
+
 def peers(rng: np.random.Generator, machines: int) -> None:
     names = (
         "old gains",
+        "old gains + shaper",
         "relay, Ziegler-Nichols",
         "symmetric optimum",
-        "old gains + shaper",
+        "rule of thumb",
+        "design, soft",
         "design, normal",
+        "design, stiff",
     )
     found: dict[str, list[tuple[float, float, float]]] = {name: [] for name in names}
     unstable = dict.fromkeys(names, 0)
@@ -98,24 +111,29 @@ def peers(rng: np.random.Generator, machines: int) -> None:
             lengths = (2, *lengths[1:])
         one = case(rng, lengths, 0.01)
         machine = machine_of(one.true)
-        tuning = design(one.found, one.sides, one.moves)
+        designed = {
+            name: servos_of(one, design(one.found, one.sides, one.moves, response=name))
+            for name in ("soft", "normal", "stiff")
+        }
+        ruled = tuple(Servo(loop, 500.0, TIMING) for loop in rule(one.found))
         shapers = []
         for k in range(len(lengths)):
             there = swing(machine, one.old, k)
             shapers.append(None if there is None else klipper_choice(there[0])[1:])
         for name, servos, shaped in (
             ("old gains", one.old, None),
-            ("relay, Ziegler-Nichols", relay(one.true, TIMING), None),
-            ("symmetric optimum", symmetric_optimum(one.true, TIMING, 500.0), None),
             ("old gains + shaper", one.old, shapers),
-            ("design, normal", servos_of(one, tuning), None),
+            ("relay, Ziegler-Nichols", fed(one, relay(one.true, TIMING)), None),
+            ("symmetric optimum", fed(one, symmetric_optimum(one.true, TIMING, 500.0)), None),
+            ("rule of thumb", ruled, None),
+            *((f"design, {name}", servos, None) for name, servos in designed.items()),
         ):
             height = peaks(machine, servos)
             if not np.isfinite(height).all():
                 unstable[name] += 1
                 continue
             for k, (motor, load) in enumerate(moved(machine, servos, one.moves, shaped)):
-                settled = max(motor.positioning_time, load.positioning_time) - one.moves[k].duration
+                settled = max(motor.settling_time, load.settling_time)
                 found[name].append((settled, height[k], load.residual_rms / one.moves[k].distance))
     print(
         f"\nPeers on {machines} machines with new tooling (median and 90 % of all axes, true machine)"

@@ -132,6 +132,37 @@ def test_an_axis_that_can_not_be_improved_keeps_its_own_and_the_others_are_desig
     assert max(a.margins.sensitivity_peak for a in tuning.prediction.axes) <= 2.0 * 1.02
 
 
+def test_an_axis_whose_drive_is_too_coarse_keeps_its_own(random_model: RandomModel) -> None:
+    model = random_model(np.random.default_rng(8), (2, 1))
+    sides = sides_of(model, [Servo(loop) for loop in rule(model)])
+    best = dict(sides[0].present or {})
+    coarse = {"velocity_p": Hold(40.0 * best["velocity_p"], whole=True, low=1, high=9)}
+    sides[0] = replace(sides[0], holds=coarse)
+    tuning = design(model, sides)
+    assert tuning.axes[0].parameters == {n: best[n] for n in tuning.axes[0].parameters}
+    assert tuning.axes[1].parameters["velocity_p"] != (sides[1].present or {})["velocity_p"]
+    assert any(note.startswith("axis1: nothing better") for note in tuning.notes)
+    assert tuning.bound == pytest.approx(1.7)
+
+
+def test_a_softer_response_is_not_forced_on_an_axis_that_is_within_the_bound(
+    random_model: RandomModel,
+) -> None:
+    """What a stiff design left in the drive is faster than a normal one: kept, unless soft is asked."""
+    model = random_model(np.random.default_rng(8), (2,))
+    first = design(model, sides_of(model), response="stiff")
+    (side,) = sides_of(model)
+    held = [replace(side, present={**first.axes[0].parameters, "velocity_filter": 600.0})]
+    normal, soft = (design(model, held, response=name) for name in ("normal", "soft"))
+    for tuning in (normal, soft):
+        assert tuning.prediction is not None
+        assert tuning.prediction.axes[0].margins.sensitivity_peak <= 1.02 * tuning.bound
+    assert normal.prediction is not None
+    assert normal.present is not None
+    assert arrival(normal.prediction.axes[0]) <= 1.05 * arrival(normal.present.axes[0])
+    assert soft.bound == pytest.approx(1.4)
+
+
 def test_filters_of_a_drive_that_can_not_set_them_stay(random_model: RandomModel) -> None:
     model = random_model(np.random.default_rng(9), (2,))
     (side,) = sides_of(model, [Servo(loop) for loop in rule(model)])
