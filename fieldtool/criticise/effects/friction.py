@@ -62,7 +62,7 @@ class CoulombFriction(Effect):
         """At the last mass, rounded around standstill."""
         if self.location == "motor":
             return structure
-        dry = (values["torque"], values["rounding"], 0.0)
+        dry = (values["torque"], values["rounding"], 0.0, 0.0)
         return structure.with_elements(Element(Law.DRY, int(structure.ends[self.axis]), -1, dry))
 
 

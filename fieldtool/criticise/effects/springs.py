@@ -12,6 +12,8 @@ from fieldtool.criticise.simulate.structure import Element, Law, Relaxation, Str
 
 GAPS = (0.02, 0.2, 1.0, 4.0)
 """Start values of half the gap over the RMS of the elongation that rigid masses would ask for."""
+LOSS = 0.05
+"""Start value of the damper of a contact over the root of stiffness times mass."""
 BRANCHES = 7
 """Maxwell branches that make damping nearly the same at all frequencies."""
 MODES = 16
@@ -48,7 +50,7 @@ class HardeningSpring(SpringEffect):
     def structure(self, structure: Structure, values: Values) -> Structure:
         """Add the cubic part."""
         a, b = self.ends_of(structure)
-        return structure.with_elements(Element(Law.CUBIC, a, b, (values["cubic"], 0.0, 0.0)))
+        return structure.with_elements(Element(Law.CUBIC, a, b, (values["cubic"], 0.0, 0.0, 0.0)))
 
 
 class SofteningSpring(SpringEffect):
@@ -66,15 +68,17 @@ class SofteningSpring(SpringEffect):
         """Take off what the spring lacks."""
         a, b = self.ends_of(structure)
         k, _ = self.stiffness_of(structure)
-        return structure.with_elements(Element(Law.SOFT, a, b, (values["cubic"], k, 0.0)))
+        return structure.with_elements(Element(Law.SOFT, a, b, (values["cubic"], k, 0.0, 0.0)))
 
 
 class Backlash(SpringEffect):
     """A gap within which the spring does nothing."""
 
     name = "backlash"
-    equation = "tau = k (s - half_gap sign(s)) for abs(s) > half_gap, else 0"
-    source = "Nordin and Gutman, Automatica 38, 2002 (dead zone)"
+    equation = (
+        "tau = k p + (c + contact_damper) p' for p = abs(s) - half_gap > 0, never pulling; else 0"
+    )
+    source = "Nordin and Gutman, Automatica 38, 2002 (dead zone with a damped contact)"
     signature = "resonances that rise with the amplitude and fall steeply with small ones"
     contrary = "a torque while the axis moves at constant speed; growth with the amplitude"
 
@@ -82,7 +86,8 @@ class Backlash(SpringEffect):
         """Put the dead zone into the spring."""
         a, b = self.ends_of(structure)
         k, c = self.stiffness_of(structure)
-        return structure.with_elements(Element(Law.GAP, a, b, (k, c, values["half_gap"])))
+        gap = (k, c, values["half_gap"], values["contact_damper"])
+        return structure.with_elements(Element(Law.GAP, a, b, gap))
 
     def plain(self, values: Values) -> dict[str, tuple[float, str, tuple[str, ...]]]:
         """The whole gap, as it is usually stated."""
@@ -90,6 +95,11 @@ class Backlash(SpringEffect):
         return {
             "half_gap": (values["half_gap"], unit, ("half_gap",)),
             "gap": (2 * values["half_gap"], unit, ("half_gap",)),
+            "contact_damper": (
+                values["contact_damper"],
+                self.parameters[1].unit,
+                ("contact_damper",),
+            ),
         }
 
 
@@ -106,7 +116,7 @@ class StiffnessChange(SpringEffect):
         """Add what is gained from then on."""
         a, b = self.ends_of(structure)
         k, _ = self.stiffness_of(structure)
-        step = (k * values["change"], values["time"], 0.0)
+        step = (k * values["change"], values["time"], 0.0, 0.0)
         return structure.with_elements(Element(Law.STEP, a, b, step))
 
 
@@ -172,10 +182,18 @@ def spring_candidates(context: Context) -> list[Effect]:
                     "cubic", f"{per}3", 0.0, low, high, 0.01 * k / size**2, linear=True
                 )
                 out.append(kind(axis, (cubic,), place))
+            hard = float(np.sqrt(k * chain.masses[spring + 1].value))
+            lossy = Parameter(
+                "contact_damper", context.per(axis, "s"), LOSS * hard, 1e-3 * LOSS * hard, 2 * hard,
+                0.5 * LOSS * hard,
+            )  # fmt: skip
             out += [
                 Backlash(
                     axis,
-                    (Parameter("half_gap", length, g * size, 0.0, 20 * size, 0.1 * g * size),),
+                    (
+                        Parameter("half_gap", length, g * size, 0.0, 20 * size, 0.1 * g * size),
+                        lossy,
+                    ),
                     place,
                 )
                 for g in GAPS

@@ -37,7 +37,7 @@ FAMILIES = (
     frozenset({"measurement_delay", "torque_lag"}),
     frozenset({"cogging", "encoder_error", "gravity"}),
 )  # fmt: skip
-FREE_OF_BOUNDS = ("presliding", "rounding", "frequency", "time")
+FREE_OF_BOUNDS = ("presliding", "rounding", "frequency", "time", "contact_damper")
 """Numbers whose bounds are where the search begins, not what is physical."""
 STRENGTH = {
     "viscous_friction": ("coefficient",),

@@ -56,6 +56,8 @@ ELSEWHERE, ELSEWHERE_LOOSE = 0.01, 0.3
 """Relative change of a mass, spring or coupling, and of a damper or friction, that bends a fit."""
 TRACE = 0.01
 """Share of the error that a candidate must be expected to explain to be fitted in full."""
+SIMPLER = {"cogging": ("gravity",)}
+"""What is the same but for a number that is fixed: a wave of the position of one a turn."""
 Advance = Callable[[str, float], None]
 
 
@@ -290,9 +292,8 @@ def _winner(prepared: Prepared, tried: Sequence[Tried], rejected: Reasons) -> Ac
     order = sorted(tried, key=lambda t: t.gain.after)
     best = order[0]
     for other in order[1:]:
-        contained = (
-            other.effect.axis == best.effect.axis and other.effect.name in best.effect.replaces
-        )
+        simpler = (*best.effect.replaces, *SIMPLER.get(best.effect.name, ()))
+        contained = other.effect.axis == best.effect.axis and other.effect.name in simpler
         lost = other.gain.after - best.gain.after
         alike = difference(simulator, other.fitted, best.fitted).t < ALIKE_T
         if (

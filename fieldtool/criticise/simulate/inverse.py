@@ -15,11 +15,11 @@ from scipy.linalg import expm
 
 from fieldtool.criticise.simulate.kernels import march, march_bent, ring
 from fieldtool.criticise.simulate.motion import Motion
-from fieldtool.criticise.simulate.structure import Structure
+from fieldtool.criticise.simulate.structure import Law, Structure
 
 FloatArray = NDArray[np.float64]
-LARGEST_TURN = 0.25
-"""Of the fastest hidden mode in one sub-step, rad, where elements are not linear."""
+LARGEST_TURN, LARGEST_TURN_GAP = 0.25, 0.1
+"""Of the fastest hidden mode in one sub-step, rad, where elements are not linear, or jump."""
 MOST_SUBSTEPS = 32
 FADED = 1e-3
 """Of its first size: a free motion counts as gone."""
@@ -147,7 +147,9 @@ class Driven:
         """Sub-steps that resolve the fastest swing; what only decays is exact, follows the masses."""
         rates = np.linalg.eigvals(self.system.rates)
         fastest = float(np.abs(rates[rates.imag != 0.0]).max(initial=0.0))
-        return int(np.clip(np.ceil(fastest * self.step / LARGEST_TURN), 1, MOST_SUBSTEPS))
+        gap = any(e.law is Law.GAP for e in self.structure.elements)
+        turn = fastest * self.step / (LARGEST_TURN_GAP if gap else LARGEST_TURN)
+        return int(np.clip(np.ceil(turn), 1, MOST_SUBSTEPS))
 
     @cached_property
     def tables(self) -> tuple[FloatArray, ...]:

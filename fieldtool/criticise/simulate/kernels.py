@@ -128,15 +128,16 @@ def pull(
 
     ``t`` is when the sample began, ``elapsed`` the time since, ``span`` that to the next sample.
     """
-    p0, p1, p2 = float(values[0]), float(values[1]), float(values[2])
+    p0, p1, p2, p3 = float(values[0]), float(values[1]), float(values[2]), float(values[3])
     if law == CUBIC:
         return p0 * s * s * s
     if law == GAP:
+        linear = p0 * s + p1 * rate
         if s > p2:
-            return -p0 * p2
+            return max(0.0, p0 * (s - p2) + (p1 + p3) * rate) - linear
         if s < -p2:
-            return p0 * p2
-        return -p0 * s - p1 * rate
+            return min(0.0, p0 * (s + p2) + (p1 + p3) * rate) - linear
+        return -linear
     if law == STEP:
         return p0 * s if t + elapsed * span >= p1 else 0.0
     if law == SOFT:

@@ -22,7 +22,8 @@ class Law(IntEnum):
     CUBIC = 1
     """p0 s**3."""
     GAP = 2
-    """Takes away the spring p0 and the damper p1 while abs(s) < p2, and shortens s by p2 else."""
+    """Makes of the spring p0 and the damper p1 a gap of half p2: nothing while p = abs(s) - p2 < 0, and
+    p0 p + (p1 + p3) p' else, never pulling."""
     STEP = 3
     """p0 s from the time p1 on."""
     DRY = 4
@@ -39,8 +40,8 @@ class Element:
     first: int
     second: int
     """-1 is ground."""
-    values: tuple[float, float, float]
-    """p0, p1, p2."""
+    values: tuple[float, float, float, float]
+    """p0, p1, p2, p3."""
 
 
 @dataclass(frozen=True)
