@@ -1,16 +1,26 @@
 """What a simulated machine has beyond chains of masses and springs, with the names of ``model.yaml``.
 
+Where a number is the same as in ``model.yaml`` and ``criticism.yaml`` it has their name; the plant's own
+name, by which Python knows it, is read as well.
+
 Numbers are SI: N m, rad, kg m2 on a rotary axis; N, m, kg on a linear one.  ``location`` is the chain's
 first (motor) or last (load) mass, ``joint`` the number of a spring from the motor, from 1.
 """
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import AliasChoices, Field, model_validator
 
 from drives.profile.values import Name, NotNegative, Number, Part, Positive
 
 Location = Literal["motor", "load"]
+
+
+def _told(name: str, own: str) -> Any:
+    """A key that is told by the name of ``model.yaml``, and read by the plant's own name, too."""
+    return Field(validation_alias=AliasChoices(name, own))
+
+
 Joint = Annotated[int, Field(ge=1, le=16, strict=True)]
 
 
@@ -49,8 +59,8 @@ class AsymmetricFrictionProfile(Part):
 
     effect: Literal["asymmetric_friction"]
     location: Location = "motor"
-    forward: Positive
-    backward: Positive
+    forward: Positive = _told("coulomb_positive", "forward")
+    backward: Positive = _told("coulomb_negative", "backward")
 
 
 class BacklashProfile(Part):
@@ -58,7 +68,7 @@ class BacklashProfile(Part):
 
     effect: Literal["backlash"]
     joint: Joint = 1
-    play: Positive
+    play: Positive = _told("gap", "play")
     """From contact to contact."""
     restitution: Annotated[Number, Field(ge=0.1, le=1)] = 0.6
 
@@ -117,7 +127,7 @@ class CoggingProfile(Part):
     """Torque of the motor's magnets."""
 
     effect: Literal["cogging"]
-    torque: Positive
+    torque: Positive = _told("amplitude", "torque")
     """Amplitude of the first harmonic."""
     periods: Positive
     """A revolution, or a metre."""
@@ -145,10 +155,10 @@ class ExtraModeProfile(Part):
 
     effect: Literal["extra_mode"]
     location: Location = "load"
-    inertia: Positive
+    inertia: Positive = _told("mass", "inertia")
     frequency: Positive
     """Of the mass with the other end held, Hz."""
-    damping: NotNegative = 0.02
+    damping: NotNegative = Field(0.02, validation_alias=AliasChoices("damping_ratio", "damping"))
     """Damping ratio."""
 
 
@@ -156,14 +166,14 @@ class TorqueScaleProfile(Part):
     """The motor gives this many times the torque that the drive reports."""
 
     effect: Literal["torque_scale"]
-    factor: Positive
+    factor: Positive = _told("scale", "factor")
 
 
 class TorqueSaturationProfile(Part):
     """The motor never gives more than this, whatever the drive reports."""
 
     effect: Literal["torque_saturation"]
-    torque: Positive
+    torque: Positive = _told("limit", "torque")
 
 
 class TorqueLagProfile(Part):
@@ -178,7 +188,7 @@ class MeasurementDelayProfile(Part):
     """The position that the host gets is older than the torque."""
 
     effect: Literal["measurement_delay"]
-    time: Annotated[Number, Field(ge=0, le=0.1)]
+    time: Annotated[Number, Field(ge=0, le=0.1)] = _told("delay", "time")
     """Seconds; whole steps of 1/8000 s."""
 
 
@@ -207,7 +217,7 @@ class CouplingSpringProfile(Part):
     effect: Literal["coupling_spring"]
     axes: tuple[Name, Name]
     location: Location = "load"
-    spring: Positive
+    spring: Positive = _told("stiffness", "spring")
     damper: NotNegative = 0.0
 
 

@@ -104,7 +104,7 @@ def _value(number: Any) -> float:
 
 def _between(out: Rebuilt, name: str, axes: tuple[str, ...], values: Mapping[str, float]) -> None:
     if name == "coupling_spring" and values.get("stiffness", 0.0) > 0:
-        out.between.append({"effect": name, "axes": list(axes), "spring": values["stiffness"]})
+        out.between.append({"effect": name, "axes": list(axes), "stiffness": values["stiffness"]})
     elif name == "coupling_inertia" and "inertia" in values:
         part = {
             "effect": name,
@@ -144,8 +144,8 @@ def _asymmetric(out: Rebuilt, g: Given) -> None:
     forward, backward = v["coulomb_positive"], v["coulomb_negative"]
     wet = (v["viscous_positive"], v["viscous_negative"])
     _add(
-        out, g, "asymmetric_friction", forward=max(forward, 1e-9), backward=max(backward, 1e-9),
-        location=g.end,
+        out, g, "asymmetric_friction", coulomb_positive=max(forward, 1e-9),
+        coulomb_negative=max(backward, 1e-9), location=g.end,
     )  # fmt: skip
     mean = sum(wet) / 2
     out.viscous[g.axis] = out.viscous.get(g.axis, 0.0) + max(mean, 0.0)
@@ -160,7 +160,7 @@ def _backlash(out: Rebuilt, g: Given) -> None:
     # the model's dead zone gives back what it takes
     play = g.values["gap"] if "gap" in g.values else 2 * g.values["half_gap"]
     if play > 0:
-        _add(out, g, "backlash", play=play, restitution=1.0, joint=g.joint)
+        _add(out, g, "backlash", gap=play, restitution=1.0, joint=g.joint)
 
 
 def _hardening(out: Rebuilt, g: Given) -> None:
@@ -196,7 +196,7 @@ def _gravity(out: Rebuilt, g: Given) -> None:
 def _cogging(out: Rebuilt, g: Given) -> None:
     periods = g.values["order"] / (2 * pi) if g.linear else g.values["order"]
     _add(
-        out, g, "cogging", torque=g.values["amplitude"], periods=periods, phase=g.values["phase"],
+        out, g, "cogging", amplitude=g.values["amplitude"], periods=periods, phase=g.values["phase"],
         sharpness=0.0,
     )  # fmt: skip
 
@@ -211,7 +211,7 @@ def _encoder(out: Rebuilt, g: Given) -> None:
 
 
 def _scale(out: Rebuilt, g: Given) -> None:
-    _add(out, g, "torque_scale", factor=g.values["scale"])
+    _add(out, g, "torque_scale", scale=g.values["scale"])
 
 
 def _lag(out: Rebuilt, g: Given) -> None:
@@ -226,7 +226,7 @@ def _lag(out: Rebuilt, g: Given) -> None:
 def _delay(out: Rebuilt, g: Given) -> None:
     delay = g.values["delay"]
     if delay >= STEP / 2:
-        _add(out, g, "measurement_delay", time=delay)
+        _add(out, g, "measurement_delay", delay=delay)
     elif delay <= -STEP / 2:
         out.left_out.append(
             f"measurement_delay of {g.axis}: a position that is measured {-delay:.2g} s earlier "
@@ -237,8 +237,8 @@ def _delay(out: Rebuilt, g: Given) -> None:
 def _extra(out: Rebuilt, g: Given) -> None:
     v = g.values
     _add(
-        out, g, "extra_mode", inertia=v["mass"], frequency=v["frequency"],
-        damping=max(v["damping_ratio"], 0.0), location=g.end,
+        out, g, "extra_mode", mass=v["mass"], frequency=v["frequency"],
+        damping_ratio=max(v["damping_ratio"], 0.0), location=g.end,
     )  # fmt: skip
 
 
@@ -258,7 +258,7 @@ def _changed(out: Rebuilt, g: Given) -> None:
 
 
 def _saturation(out: Rebuilt, g: Given) -> None:
-    _add(out, g, "torque_saturation", torque=g.values["limit"])
+    _add(out, g, "torque_saturation", limit=g.values["limit"])
 
 
 MAKERS: dict[str, Callable[[Rebuilt, Given], None]] = {

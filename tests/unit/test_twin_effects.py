@@ -141,6 +141,27 @@ def test_friction_with_directions_gives_its_dry_part_and_the_mean_of_its_viscous
                   "viscous_negative": 0.04, "presliding": 1e-5, "rounding": 1e-3}  # fmt: skip
     entry = {"effect": "asymmetric_friction", "axis": "a", "parameters": parameters}
     out = rebuilt((entry,), {"a": ("rotary", ())})
-    assert out.parts["a"][0]["forward"] == 0.2
+    assert out.parts["a"][0]["coulomb_positive"] == 0.2
     assert out.viscous["a"] == pytest.approx(0.03)
     assert "mean" in out.left_out[0]
+
+
+@pytest.mark.parametrize(
+    ("told", "own", "effect"),
+    [
+        ("delay", "time", "measurement_delay"),
+        ("gap", "play", "backlash"),
+        ("limit", "torque", "torque_saturation"),
+        ("scale", "factor", "torque_scale"),
+        ("amplitude", "torque", "cogging"),
+    ],
+)
+def test_profiles_read_the_names_of_models_and_the_plants_own(fresh_rng, told, own, effect):
+    value = fresh_rng.uniform(1e-3, 1e-2)
+    more = {"periods": 24.0} if effect == "cogging" else {}
+    parts = [
+        chain_effect(ADAPTER.validate_python({"effect": effect, name: value} | more), "rotary")
+        for name in (told, own)
+    ]
+    assert parts[0] == parts[1]
+    assert getattr(parts[0], own) == pytest.approx(value)

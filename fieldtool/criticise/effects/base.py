@@ -54,6 +54,9 @@ class Effect:
     shows: ClassVar[tuple[str, ...]] = ()
     """Views of the error (:mod:`fieldtool.criticise.where.views`): one at least has to show it."""
 
+    spreads: ClassVar[bool] = False
+    """Whether couplings pass on what is unknown of it to all axes."""
+
     axis: int
     parameters: tuple[Parameter, ...]
     location: str = "motor"

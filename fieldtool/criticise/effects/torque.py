@@ -118,6 +118,7 @@ class PeriodicDisturbance(Effect):
     source = "a neighbour's drive, a pump, the mains; Bodson, Adaptive Algorithms, 2005"
     signature = "one line of the spectrum at the same frequency in all experiments"
     contrary = "a frequency that goes with the speed or the period of the excitation"
+    spreads = True
 
     def unknown(self, motion: Motion, values: Values) -> tuple[FloatArray, ...]:
         """Return sine and cosine, of unknown size."""
@@ -192,11 +193,20 @@ def disturbance_candidates(context: Context) -> list[Effect]:
             if level[k] > STANDS_OUT:
                 f = _between_lines(longest.torque.shape[0], context, longest, axis, grid[inside][k])
                 low, high = _off_harmonics(context, f, 1.5 * width)
-                if not low < f < high:
+                if not low < f < high or _passed_on(context, longest, axis, f):
                     continue
                 number = Parameter("frequency", "Hz", f, low, high, 0.1 * width)
                 out.append(PeriodicDisturbance(axis, (number,)))
     return out
+
+
+def _passed_on(context: Context, motion: Motion, axis: int, frequency: float) -> bool:
+    """Whether a line is stronger in another axis, from which couplings pass it on."""
+    error = context.errors[context.motions.index(motion)]
+    turning = np.exp(-2j * np.pi * frequency * motion.clock) * np.hanning(motion.rows)
+    mass = np.sqrt([context.inertia(k) for k in range(error.shape[1])])
+    size = np.abs(turning @ error) / mass
+    return bool(size[axis] < size.max())
 
 
 def _off_harmonics(context: Context, frequency: float, reach: float) -> tuple[float, float]:

@@ -208,9 +208,11 @@ def _without_unknown(hypothesis: Hypothesis, lines: Lines, values: FloatArray) -
             continue
         place = hypothesis.effects.index(effect)
         for course in effect.unknown(lines.motion, hypothesis.values[place]):
-            full = np.zeros_like(lines.motion.position)
-            full[:, effect.axis] = course
-            columns.append(lines.projected(flat(lines.raw(full) * lines.weight)))
+            axes = range(lines.weight.shape[1]) if effect.spreads else (effect.axis,)
+            for axis in axes:
+                full = np.zeros_like(lines.motion.position)
+                full[:, axis] = course
+                columns.append(lines.projected(flat(lines.raw(full) * lines.weight)))
     if not columns:
         return values
     stacked = np.column_stack(columns)
