@@ -18,6 +18,8 @@ STANDS_OUT = 12.0
 AROUND = 12
 OFF_HARMONICS = 0.6
 """Lines from the harmonics of the excitation within which nothing is called a disturbance."""
+BENDS = 0.2
+"""Of the largest torque: what bends over a wider range than this is no limit."""
 CLIPPED = (0.95, 0.85, 0.7, 0.5)
 """Start values of the limit over the largest torque."""
 
@@ -101,7 +103,7 @@ class TorqueSaturation(Effect):
     def reported(self, torque: FloatArray, motion: Motion, values: Values) -> FloatArray:
         """Add what the drive reported beyond the limit."""
         asked = motion.torque[:, self.axis]
-        size, width = np.abs(asked), values["rounding"]
+        size, width = np.abs(asked), max(values["rounding"], 1e-6 * values["limit"])
         given = values["limit"] - width * np.logaddexp(0.0, (values["limit"] - size) / width)
         # At rest nothing is given: what the rounded corner lacks there is the same everywhere.
         none = values["limit"] - width * np.logaddexp(0.0, values["limit"] / width)
@@ -154,8 +156,8 @@ def torque_candidates(context: Context) -> list[Effect]:
                         "rounding",
                         context.torque_unit(axis),
                         0.03 * largest,
-                        1e-3 * largest,
-                        0.3 * largest,
+                        0.0,
+                        BENDS * largest,
                         0.02 * largest,
                     ),
                 ),

@@ -139,7 +139,8 @@ def _unphysical(tried: Tried, context: Context) -> str:
     effect, values = tried.effect, tried.fitted.hypothesis.values[tried.place]
     numbers = tried.fitted.of_effect(tried.place)
     for p in effect.parameters:
-        if p.scale <= 0.0 or (p.name in FREE_OF_BOUNDS and effect.name != "extra_mode"):
+        free = p.name in FREE_OF_BOUNDS and effect.name not in ("extra_mode", "torque_saturation")
+        if p.scale <= 0.0 or free:
             continue
         close = 1e-6 * max(abs(p.high - p.low), 1e-300)
         at_zero = p.low == 0.0 and values[p.name] <= close
