@@ -13,6 +13,7 @@ import can
 from drives.canopen_drive.drive import CanopenDrive
 from drives.canopen_drive.line import NMT_OPERATIONAL
 from drives.canopen_drive.setup import DRIVE_HEARTBEAT
+from drives.canopen_drive.unseen import FLOOR, Unseen
 from drives.cia402 import ENABLED_MASK, ENABLED_VALUE, PowerState, emergency_text
 
 OUTPUT = struct.Struct("<Hih")
@@ -35,6 +36,9 @@ STUCK_SHARE, STUCK_UNITS, STUCK_TIME = 8, 20, 0.02
 """A target that moves by a part of the following error window, and by so many units at least,
 while the position does not change at all for so many seconds: the encoder is stuck, or the axis is
 blocked."""
+STUCK_SHARE_KNOWN = 2
+"""That part, where the axis' friction is known: then its torque tells sooner (``unseen``), and friction
+may need that much."""
 STUCK_SLOWEST = 10.0
 """Natural frequency of the slowest position loop, rad/s: it is given the time to drive an axis that
 reverses on across one unit of its encoder."""
@@ -100,6 +104,8 @@ class Channel:
     """Whether the torque in its PDO is the torque offset 0x60B2."""
     offset: int = 0
     """Torque offset sent last, per mille of the rated torque."""
+    unseen: Unseen | None = None
+    """Looks for motion that the encoder does not show; None for a floating axis."""
 
     @property
     def state(self) -> PowerState | None:
@@ -119,13 +125,14 @@ class Channel:
         self.previous = self.position
         first = not self.last
         self.last = data
-        self.statusword, self.position, _ = INPUT.unpack(data)
+        self.statusword, self.position, torque = INPUT.unpack(data)
         if first:
             self.previous = self.position
         self.still += 1
         if self.position != self.previous:
             self.anchor, self.still = None, 0
         self._judge_jump()
+        self._judge_unseen(torque)
         cycles = 1 + self.missing + self.paused
         self.allowed = ceil(self.step * cycles)
         self._judge_span(cycles)
@@ -142,6 +149,14 @@ class Channel:
                 self.jumped, self.jumped_ago = change, JUMP_CYCLES
         self.step_before = step if even else None
 
+    def _judge_unseen(self, torque: int) -> None:
+        if self.unseen is None:
+            return
+        if self.missing or self.paused or self.statusword & ENABLED_MASK != ENABLED_VALUE:
+            self.unseen.restart()
+        else:
+            self.unseen.take(self.position, torque)
+
     def _judge_span(self, cycles: float) -> None:
         if self.span_begin is None:
             self.span_begin = self.position
@@ -151,13 +166,21 @@ class Channel:
             self.too_fast = abs(self.position - self.span_begin) > self.span_units * share
             self.span_begin, self.span_count = self.position, 0.0
 
+    @property
+    def alarm(self) -> str:
+        """What makes it sure that the axis moves unseen, or was caught; else empty."""
+        return self.unseen.alarm if self.unseen is not None else ""
+
     def is_stuck(self, target: int) -> bool:
         """Whether the position stands while the target moves."""
         if self.anchor is None or target == self.anchor:
             self.anchor, self.still = target, 0  # counted from where the target begins to move
         if self.free or self.still < self.still_allowed:
             return False
-        return abs(target - self.anchor) > max(self.window // STUCK_SHARE, STUCK_UNITS)
+        share = STUCK_SHARE
+        if self.unseen is not None and self.unseen.knows:
+            share = STUCK_SHARE_KNOWN
+        return abs(target - self.anchor) > max(self.window // share, STUCK_UNITS)
 
     def is_fine(self, target: int, now: float) -> bool:
         """Whether the drive is enabled, heard, and inside all limits; target in position units."""
@@ -170,6 +193,7 @@ class Channel:
             and not self.too_fast
             and (self.free or -self.window <= target - position <= self.window)
             and not self.is_stuck(target)
+            and not self.alarm
             and not self.emergencies
             and self.missing <= MISSING_ALLOWED
             and self.stray <= STRAY_ALLOWED
@@ -229,6 +253,8 @@ class Channel:
                 f"{limits.following_error:g} {unit}; all axes were stopped. Does the axis move the "
                 "wrong way, or is it blocked?"
             )
+        if self.unseen is not None and self.alarm:
+            return self._unseen_words(self.unseen)
         if self.is_stuck(target):
             return (
                 f"{drive.axis}: does not move at all while its target moves; its power was cut and "
@@ -252,6 +278,23 @@ class Channel:
             f"{drive.axis}: node {drive.node_id} sent no heartbeat for "
             f"{HEARTBEATS_MISSED * DRIVE_HEARTBEAT:.2g} s; all axes were stopped. Check its supply "
             "and its cable."
+        )
+
+    def _unseen_words(self, unseen: Unseen) -> str:
+        drive, scale = self.drive, self.drive.scaling
+        way = f"{abs(unseen.way) * scale.position:.2g} {drive.position_unit}"
+        torque = f"{INPUT.unpack(self.last)[2] * scale.torque:.3g} {drive.torque_unit}"
+        seen = (
+            "stands dead from one cycle to the next, though it moved and nothing has ever stopped it so "
+            "suddenly"
+            if unseen.alarm == "dead"
+            else f"stands under a torque of {torque}, which is more than it has ever stood under"
+        )
+        return (
+            f"{drive.axis}: {seen}; its power was cut and all axes were stopped. Either its encoder "
+            f"does not count (cable, supply), and it has moved by about {way} unseen, or its brake, a "
+            "stop or friction holds it. Both look the same from here: turn it by hand with the power "
+            "off, and see whether its position changes."
         )
 
     def trouble(self) -> str:
@@ -281,6 +324,9 @@ def channel_of(
         JUMP_TORQUES * limits.torque / lightest * cycle_time**2, limits.velocity * cycle_time
     )
     window = floor(min(limits.following_error / scale.position * (1 + 1e-12), _MOST_UNITS))
+    wind_up = sum(limits.torque / k for k in drive.axis_profile.prior.springs) / scale.position
+    push = scale.torque / sum(drive.axis_profile.prior.masses) * cycle_time**2 / scale.position
+    floor_torque = 2 + FLOOR * limits.torque / scale.torque
     return Channel(
         drive,
         free,
@@ -295,6 +341,9 @@ def channel_of(
         takes_offset=takes_offset,
         still_allowed=max(3, round(_stuck_time(window) / cycle_time)),
         window=window,
+        unseen=None
+        if free
+        else Unseen(drive.learned, push, window, floor_torque, cycle_time, wind_up),
     )
 
 

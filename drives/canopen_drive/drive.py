@@ -15,6 +15,7 @@ from drives.bus import drives_begin_anew
 from drives.canopen_drive.conversion import Conversion, quantity_objects
 from drives.canopen_drive.line import Line, Node
 from drives.canopen_drive.scaling import Scaled, read_scaling
+from drives.canopen_drive.unseen import Learned
 from drives.cia402 import Mode, PowerState, emergency_text, in_words
 from drives.errors import (
     DriveFaultError,
@@ -56,6 +57,8 @@ class CanopenDrive:
         line.add_node(self.node)
         self._identity: DriveIdentity | None = None
         self._scaled: Scaled | None = None
+        self.learned = Learned()
+        """What its motion has shown so far; learned while it moves."""
 
     @property
     def axis(self) -> str:

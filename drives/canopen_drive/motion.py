@@ -602,7 +602,7 @@ class CanopenMotion:
                     channel.violation(target, self._cycle_time),
                     axis=channel.drive.axis,
                     cycle=self._count - 1,
-                    runaway=channel.is_stuck(target),
+                    runaway=channel.is_stuck(target) or bool(channel.alarm),
                 )
 
     def _look(self, targets: Sequence[int], offsets: Sequence[int]) -> None:

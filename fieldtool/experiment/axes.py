@@ -48,6 +48,11 @@ class Axes:
 
     inertia: FloatArray | None = None
     """Of each axis by the prior model, all its masses, shape (M,), kg m2 or kg; None: not known."""
+    stiffness: FloatArray | None = None
+    """Torque that each loop asks for at once when its target leaves it, shape (M,), N m/rad or N/m;
+    None: not known."""
+    torque_offsets: tuple[bool, ...] = ()
+    """Which drives take torque offsets with their targets; none where it is empty."""
 
     @property
     def counts(self) -> FloatArray:

@@ -1,8 +1,10 @@
 """See that every axis goes the right way, by a small move and back."""
 
+from contextlib import AbstractContextManager
+
 import numpy as np
 
-from drives.api import Capture, FloatArray, Motion
+from drives.api import Capture, FloatArray, Motion, Source
 from drives.errors import SafetyStopError, StoppedError
 from fieldtool.errors import PlanRefusedError
 from fieldtool.experiment.axes import (
@@ -22,9 +24,11 @@ from fieldtool.experiment.plausible import (
     BlindPush,
     inertia_of_move,
 )
+from fieldtool.experiment.proof import PROOF_QUIET, PROOF_SHOWN, Proof
 from fieldtool.experiment.stepped.plan import smooth_move
 from fieldtool.records.recording import Experiment
 
+CHECK_NAME = "direction check of {}"
 CHECK_REST = 0.3
 """Seconds of rest before, between and after these moves."""
 CHECK_SHARE = 0.05
@@ -43,6 +47,8 @@ CHECK_SLICE = 2
 CHECK_ASTRAY, CHECK_PUSHED = 1e-3, 10.0
 """Share of its travel that an axis may go the wrong way or drift in the check; an axis that does
 not move itself may be pushed by the factor more."""
+PUSHED_WAY = 3.0
+"""Times the way that its pulses may take an axis, by the prior model, that it may go in them."""
 CHECK_ASTRAY_ERROR = 0.004
 """Share of the following error limit that it may go astray in any case."""
 CHECK_TIME = 1.0
@@ -54,6 +60,11 @@ CHECK_STARTED = 0.02
 """Share of the check's move that an axis must have done when half of it was commanded."""
 LONGEST_MOVE = 600.0
 """Seconds that crossing the travel may take at most."""
+HELD_BY_FRICTION = (
+    "Its encoder counts, as pulses of torque showed before: friction holds it against its loops. Raise "
+    "its gains position_p, velocity_p and velocity_i, or see whether its brake drags."
+)
+HELD_BY_ANYTHING = "Is it blocked or its brake closed, or does the encoder not count?"
 PUSH_FACTOR = 4.0
 """Standard errors beyond which the sign of a torque counts."""
 
@@ -79,22 +90,70 @@ def check_directions(group: Mover, axes: Axes, cycle_time: float, keep: Keep) ->
     _check_pace(axes)
     experiments: list[Experiment] = []
     try:
-        with group.motion(cycle_time) as motion:
+        with _enabled(group, axes, cycle_time) as motion:
             start = motion.position
+            proven = _prove(motion, axes, start, experiments.append)
+            experiments.clear()  # of these, too, only one that was cut short is worth keeping
             for k in range(len(axes.names)):
                 stands = motion.position
-                nudge = _DirectionCheck(axes, k, start, stands, cycle_time, nudge=True)
-                _stream_check(motion, nudge, axes.names[k], experiments.append)
+                nudge = _DirectionCheck(axes, k, start, stands, cycle_time, proven[k], nudge=True)
+                _stream_check(
+                    motion,
+                    nudge,
+                    f"direction check of {axes.names[k]}",
+                    axes.names[k],
+                    experiments.append,
+                )
             experiments.clear()  # of the nudges only one that was cut short is worth keeping
             for k in range(len(axes.names)):
-                check = _DirectionCheck(axes, k, start, motion.position, cycle_time)
-                capture = _stream_check(motion, check, axes.names[k], experiments.append)
+                check = _DirectionCheck(axes, k, start, motion.position, cycle_time, proven[k])
+                capture = _stream_check(
+                    motion,
+                    check,
+                    f"direction check of {axes.names[k]}",
+                    axes.names[k],
+                    experiments.append,
+                )
                 check.judge(capture)
     except BaseException as error:
         keep_whatever_happens(experiments, keep, error)
         raise
     for experiment in experiments:  # the disk may be slow: not while axes wait for their SYNC
         keep(experiment)
+
+
+def _enabled(group: Mover, axes: Axes, cycle_time: float) -> AbstractContextManager[Motion]:
+    if any(axes.torque_offsets):
+        return group.motion(cycle_time, torque_offset=True)
+    return group.motion(cycle_time)
+
+
+def _prove(motion: Motion, axes: Axes, start: FloatArray, keep: Keep) -> tuple[bool, ...]:
+    """See that every encoder counts; return of which it is sure."""
+    allowed = _astray(axes) + CHECK_COUNTS * axes.counts
+    quiet = np.maximum(PROOF_SHOWN * axes.counts, PROOF_QUIET * allowed)
+    proven, farthest = [], 0.0
+    for k, name in enumerate(axes.names):
+
+        def judge(position: FloatArray, way: float) -> None:
+            nonlocal farthest
+            farthest = max(farthest, way)
+            for j, other in enumerate(axes.names):
+                most = float(allowed[j]) + PUSHED_WAY * farthest
+                _DirectionCheck.stay(other, float(position[j] - start[j]), 0.0, most, axes.unit(j))
+
+        proof = Proof(axes, k, start, motion.cycle_time, quiet, judge)
+        if proof.asks:
+            _stream_check(motion, proof, "pulses of {}", name, keep)
+        proven.append(proof.answered)
+    return tuple(proven)
+
+
+def _astray(axes: Axes) -> FloatArray:
+    """How far each axis may go astray, shape (M,), counts of its encoder left out."""
+    travel = np.array([one.travel[1] - one.travel[0] for one in axes.limits])
+    errors = np.array([one.following_error for one in axes.limits])
+    return np.maximum(CHECK_ASTRAY * travel, CHECK_ASTRAY_ERROR * errors)
 
 
 def small_moves(axes: Axes) -> str:
@@ -104,8 +163,9 @@ def small_moves(axes: Axes) -> str:
         for k, (name, one) in enumerate(zip(axes.names, axes.limits, strict=True))
     ]
     return (
-        f"Each in turn moves slowly by {100 * CHECK_MOVE:g} % of its travel and back, after a "
-        f"nudge of a tenth of that: {', '.join(ways)}."
+        f"Pulses of torque show whether each encoder counts. Then each axis in turn moves slowly by "
+        f"{100 * CHECK_MOVE:g} % of its travel and back, after a nudge of a tenth of that: "
+        f"{', '.join(ways)}."
     )
 
 
@@ -140,15 +200,16 @@ class _DirectionCheck:
         start: FloatArray,
         stands: FloatArray,
         cycle_time: float,
+        proven: bool,
         nudge: bool = False,
     ) -> None:
         self._axes, self._k, self._start, self._nudge = axes, k, start, nudge
+        self._proven = proven
         limits = axes.limits[k]
         travel = np.array([one.travel[1] - one.travel[0] for one in axes.limits])
-        errors = np.array([one.following_error for one in axes.limits])
         sizes = CHECK_MOVE * travel
         self._slack = np.minimum(CHECK_COUNTS * axes.counts, CHECK_COUNTS_MOST * sizes)
-        astray = np.maximum(CHECK_ASTRAY * travel, CHECK_ASTRAY_ERROR * errors)
+        astray = _astray(axes)
         self._allowed = astray + self._slack
         most = np.minimum(CHECK_NUDGE_COUNTS * axes.counts, CHECK_NUDGE_MOST * sizes)
         nudges = np.maximum(CHECK_NUDGE * sizes, most)
@@ -209,14 +270,14 @@ class _DirectionCheck:
                 self._follow(name, float(moved[j]), float(self._offset[j]), allowed)
             else:
                 most = allowed * (CHECK_PUSHED if pushed else 1.0)
-                self._stay(name, float(moved[j]), float(self._offset[j]), most, self._axes.unit(j))
+                self.stay(name, float(moved[j]), float(self._offset[j]), most, self._axes.unit(j))
         if self._waiting:
             self._wait(moved)
 
     def _watch_torque(self, capture: Capture) -> None:
         """Raise if the torque has taken the axis far, by the prior model, and its encoder shows none."""
         axes, k = self._axes, self._k
-        if axes.inertia is None:
+        if self._proven or axes.inertia is None:
             return
         torque = capture.torque[:, k]
         if self._waiting or self._done <= self._rest:
@@ -258,7 +319,7 @@ class _DirectionCheck:
             self._begin_at(self._start + moved)
 
     @staticmethod
-    def _stay(name: str, moved: float, offset: float, allowed: float, unit: str) -> None:
+    def stay(name: str, moved: float, offset: float, allowed: float, unit: str) -> None:
         """Raise if it left where it stood; back to its first start, where its target is, it may go."""
         if not min(0.0, offset) - allowed <= moved <= max(0.0, offset) + allowed:
             raise SafetyStopError(
@@ -273,11 +334,12 @@ class _DirectionCheck:
     def _follow(self, name: str, moved: float, offset: float, allowed: float) -> None:
         sign, unit = float(np.sign(self._wanted)), self._axes.unit(self._k)
         size, slack = abs(self._wanted), float(self._slack[self._k])
+        held = HELD_BY_FRICTION if self._proven else HELD_BY_ANYTHING
         forward, ahead = sign * moved, sign * offset
         comes_back = self._done > 2 * self._rest + self._rows
         # it may overshoot, there as well as back
         astray = max(0.5 * size + slack, allowed) if comes_back else allowed
-        if forward < min(0.0, ahead) - astray or forward > max(0.0, ahead) + 1.5 * size + slack:
+        if forward < min(0.0, ahead) - astray or forward > max(0.0, ahead) + 1.5 * size + allowed:
             raise SafetyStopError(
                 f"{name}: moves the wrong way or by itself: {self._wanted:.3g} {unit} was commanded, it "
                 f"moved {moved - offset:.3g} {unit}; its power was cut and all axes were stopped. "
@@ -289,8 +351,7 @@ class _DirectionCheck:
         if half_way and not self._nudge and forward - ahead < CHECK_STARTED * size:
             raise SafetyStopError(
                 f"{name}: does not follow: half of {self._wanted:.3g} {unit} was commanded, it moved "
-                f"{moved - offset:.3g} {unit}; its power was cut and all axes were stopped. "
-                "Is it blocked or its brake closed, or does the encoder not count?",
+                f"{moved - offset:.3g} {unit}; its power was cut and all axes were stopped. {held}",
                 axis=name,
                 runaway=True,
             )
@@ -310,11 +371,14 @@ class _DirectionCheck:
                 axis=name,
             )
         # Whatever swings behind the motor, half way the whole axis has the momentum that the motor
-        # gave.
-        rest, half = self._rest, self._rows // 2
-        push = float((torque[rest : rest + half] - torque[:rest].mean()).sum())
-        noise = float(torque[:rest].std()) * np.sqrt(half + half**2 / rest)
-        if push * np.sign(wanted) < -PUSH_FACTOR * noise:
+        # gave.  Friction may have held it under a torque before, on the way there or back, not both.
+        rest, half, back = self._rest, self._rows // 2, 2 * self._rest + self._rows
+        starts = torque[rest : rest + half]
+        noise = float(torque[:rest].std()) * np.sqrt(2 * half + half**2 / rest)
+        pushes = np.array(
+            [(starts - torque[:rest].mean()).sum(), (starts - torque[back : back + half]).sum()]
+        )
+        if np.all(pushes * np.sign(wanted) < -PUSH_FACTOR * noise):
             raise SafetyStopError(
                 f"{name}: the torque that starts a positive move is negative; all axes were stopped. "
                 "Check the drive's polarity (0x607E).",
@@ -347,10 +411,10 @@ class _DirectionCheck:
             )
 
 
-def _stream_check(motion: Motion, check: _DirectionCheck, driven: str, keep: Keep) -> Capture:
+def _stream_check(motion: Motion, check: Source, name: str, driven: str, keep: Keep) -> Capture:
     def experiment(capture: Capture, note: str = "") -> Experiment:
         return Experiment(
-            name=f"direction check of {driven}",
+            name=name.format(driven),
             kind="moves",
             driven=(driven,),
             free=(),

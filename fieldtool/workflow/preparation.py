@@ -110,4 +110,14 @@ def axes_of(group: CanopenGroup, setting: Setting) -> Axes:
     units = tuple(drive.position_unit for drive in group.drives)
     resolution = np.array([drive.scaling.position for drive in group.drives])
     inertia = np.array([sum(m.value for m in axis.masses) for axis in setting.model.axes])
-    return Axes(group.axes, setting.limits, setting.centre, units, resolution, inertia)
+    stiffness = np.array([loop.position_p * loop.velocity_p for loop in setting.loops])
+    return Axes(
+        group.axes,
+        setting.limits,
+        setting.centre,
+        units,
+        resolution,
+        inertia,
+        stiffness,
+        group.torque_offsets,
+    )

@@ -2,10 +2,12 @@
 
 Run by itself it takes words of faults' names, and ``@`` with words of moments' names.
 
-Exit code, cycles until all drives that were under power had left operation enabled, time until the
-last power stage was off, how far a motor went, rows kept on the disk, and what was said.
+Exit code, cycles until all drives that were under power had left operation enabled, how far the motor
+of the faulty drive had gone by then (degrees), time until the last power stage was off, how far a motor
+went in the end, rows kept on the disk, and what was said.
 """
 
+import math
 import sys
 import textwrap
 import time
@@ -13,7 +15,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-from tests.faults.bench import Moment
+from tests.faults.bench import ARM, Moment
 from tests.faults.table import ROWS, problems, try_row
 
 MOMENTS = [word[1:] for word in sys.argv[1:] if word.startswith("@")]
@@ -25,7 +27,8 @@ def main() -> int:
     wrong = cases = 0
     began = time.process_time()
     print(
-        f"{'fault':36}{'moment':18}{'code':>5}{'cycles':>8}{'off s':>8}{'rad':>7}{'rows':>6}  outcome"
+        f"{'fault':36}{'moment':18}{'code':>5}{'cycles':>8}{'deg':>8}{'off s':>8}{'rad':>7}{'rows':>6}"
+        "  outcome"
     )
     for row in ROWS:
         if words and not any(word in row.name for word in words):
@@ -38,11 +41,13 @@ def main() -> int:
             watch = result.watch
             acted = bool(watch.powered_then) and result.code and not expected.whole
             cycles = f"{result.cycles():8.1f}" if acted else f"{'':>8}"
+            way = watch.unseen.get(ARM)
+            unseen = f"{math.degrees(way):8.2f}" if acted and way is not None else f"{'':>8}"
             off = f"{max(watch.off.values()):8.3f}" if acted and watch.off else f"{'':>8}"
             far = max(watch.farthest.values(), default=0.0)
             said = result.said.split("fieldtool: ", 1)[-1] if result.code else expected.why
             print(
-                f"{row.name:36}{moment.value:18}{result.code:5}{cycles}{off}{far:7.2f}"
+                f"{row.name:36}{moment.value:18}{result.code:5}{cycles}{unseen}{off}{far:7.2f}"
                 f"{sum(result.rows):6}  {'WRONG: ' + '; '.join(found) if found else 'ok'}"
             )
             print(textwrap.indent(textwrap.shorten(said, 220), "    "))

@@ -80,6 +80,8 @@ class Watch:
     """By node: seconds after the fault at which it had left operation enabled."""
     off: dict[int, float] = field(default_factory=dict)
     """By node: seconds after the fault at which its power stage was off."""
+    unseen: dict[int, float] = field(default_factory=dict)
+    """By node: how far its motor was from where it was when it had left operation enabled, rad."""
     farthest: dict[int, float] = field(default_factory=dict)
     """By node: how far the motor went from where it was, rad."""
 
@@ -214,14 +216,15 @@ class Bench:
         reacted_before = len(watch.reacted)
         for node in self.machine.nodes:
             one, state = node.node_id, node.motion.state
+            way = abs(self._position(node) - watch.positions_then[one])
             if one in watch.powered_then and after > 0:
                 if state is not State.OPERATION_ENABLED:
                     watch.reacted.setdefault(one, after)
+                    watch.unseen.setdefault(one, way)
                 elif reacted_before == len(watch.powered_then):
                     self._enabled_again = True
                 if not node.motion.powered:
                     watch.off.setdefault(one, after)
-            way = abs(self._position(node) - watch.positions_then[one])
             watch.farthest[one] = max(watch.farthest.get(one, 0.0), way)
         self.machine.scheduler.add(POLL, self._look)
 

@@ -7,6 +7,7 @@ moment by its nature, the table says so and why; then the command has to come to
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 from drives.sim.drive_faults import (
     BrakeClosed,
@@ -48,6 +49,7 @@ from drives.sim.frame_faults import (
 )
 from drives.sim.host_faults import BusOff, HostKilled, HostStalls, InterfaceDown, ReceiverDead
 from tests.faults.bench import ARM, TABLE, Moment, Result, try_case
+from tests.session.conftest import two_axes
 
 CYCLES = 3.0
 """Within which all drives have to have left operation enabled, where nothing else is said."""
@@ -72,6 +74,8 @@ class Expected:
     """Nodes that can not be reached, and whose objects are left as they were set."""
     farthest: float | None = None
     """rad that a motor may go at most from where it was."""
+    unseen: float | None = None
+    """rad that the motor of the faulty drive may go at most until its power is cut."""
     whole: bool = False
     """The fault shows at the end of a motion only, whose recording is whole then."""
     why: str = ""
@@ -118,6 +122,8 @@ class Row:
     still: Expected
     sweep: Expected
     write: Expected
+    profile: Callable[[], dict[str, Any]] = two_axes
+    """The machine."""
 
     def expected(self, moment: Moment) -> Expected:
         """Return what has to come at a moment."""
@@ -139,6 +145,8 @@ MEASURED = harmless("measuring writes and stores no parameters")
 MASTERS = "Two masters must not"
 NO_PDO = r"arm: node 12 sent no PDO for \d+ cycles"
 FAR = 0.5
+DEAD = "arm: stands dead .*encoder does not count.*brake"
+PUSHED = "arm: stands under a torque of .*encoder does not count.*brake"
 
 
 def _one(make: Callable[[int], Fault]) -> Callable[[int], tuple[Fault, ...]]:
@@ -199,6 +207,34 @@ def _host(name: str, fault: Fault, said: str, mid: str, **more: object) -> Row:
         stopped(mid, own=BOTH, left=BOTH, **more),
         mixed("(arm|table)"),
     )
+
+
+def with_friction() -> dict[str, Any]:
+    """Return a machine with dry friction of a fifth of the torque limit, and loops that overcome it."""
+    profile = two_axes()
+    arm = profile["simulation"]["axes"][1]
+    arm["effects"] = [{"effect": "coulomb_friction", "location": "motor", "torque": 1.2}]
+    arm["gains"] |= {"position_p": 20, "velocity_p": 2.5, "velocity_i": 25}
+    return profile
+
+
+def with_coarse_encoder() -> dict[str, Any]:
+    """Return a machine whose arm has an encoder of 2000 lines."""
+    profile = two_axes()
+    profile["simulation"]["axes"][1]["encoder_counts_per_rev"] = 8000
+    return profile
+
+
+def _still(
+    name: str,
+    fault: Callable[[int], Fault],
+    sweep: Expected,
+    unseen: float,
+    profile: Callable[[], dict[str, Any]] = two_axes,
+) -> Row:
+    """Return a fault that shows only when the motor must have moved: the position stands still."""
+    asked = stopped("arm: does not move by its encoder: .*brake", unseen=unseen, cycles=300)
+    return Row(name, _one(fault), asked, asked, sweep, NOT_IN_USE, profile)
 
 
 ROWS: tuple[Row, ...] = (
@@ -405,13 +441,20 @@ ROWS: tuple[Row, ...] = (
         sweep=stopped("(stood still|emergency 0x8130)", own=BOTH),
         write=harmless("nothing moves, and drives wait for the host"),
     ),
-    Row(
-        "encoder stuck",
-        _one(EncoderStuck),
-        stopped("arm: does not move by its encoder", farthest=12.0),
-        stopped("arm: does not move by its encoder", cycles=2500, farthest=12.0),
-        stopped("arm: does not move at all while its target moves", cycles=100, farthest=FAR),
-        NOT_IN_USE,
+    _still("encoder stuck", EncoderStuck, stopped(DEAD, unseen=0.004), 0.004),
+    _still(  # friction holds the motor in the weak pilot; it moves in what comes after it
+        "encoder stuck, friction 20 %",
+        EncoderStuck,
+        seen_late(PUSHED, unseen=0.02),
+        0.001,
+        with_friction,
+    ),
+    _still(
+        "encoder stuck, 8000 counts",
+        EncoderStuck,
+        stopped(PUSHED, unseen=0.07, cycles=60),
+        0.03,
+        with_coarse_encoder,
     ),
     Row(
         "encoder jumps",
@@ -445,14 +488,7 @@ ROWS: tuple[Row, ...] = (
         seen_late("arm: .*torque .*0x6076", (4, 5), farthest=FAR),
         NOT_IN_USE,
     ),
-    Row(
-        "brake closed",
-        _one(BrakeClosed),
-        stopped("arm: does not move by its encoder.*brake", farthest=FAR),
-        stopped("arm: does not move by its encoder.*brake", cycles=2500, farthest=FAR),
-        stopped("arm: does not move at all.*brake", cycles=100, farthest=FAR),
-        NOT_IN_USE,
-    ),
+    _still("brake closed", BrakeClosed, stopped(DEAD, unseen=1e-6), 1e-6),
     Row(
         "limit switch hit",
         _one(LimitSwitchHit),
@@ -538,7 +574,7 @@ ROWS: tuple[Row, ...] = (
 
 def try_row(row: Row, moment: Moment) -> Result:
     """Bring one fault about at one moment."""
-    return try_case(moment, row.make)
+    return try_case(moment, row.make, profile=row.profile())
 
 
 def problems(result: Result, expected: Expected, moment: Moment) -> list[str]:
@@ -576,12 +612,15 @@ def _reaction(result: Result, expected: Expected, moment: Moment) -> list[str]:
             result.cycles(*expected.own),
             max((watch.off.get(node, float("inf")) for node in expected.own), default=0.0),
         )
-        if told > expected.cycles + 0.5:
+        if told > expected.cycles + 0.501:  # a look each half cycle
             found.append(
                 f"operation enabled for {told:.1f} cycles, {expected.cycles:g} are allowed"
             )
         if own > HEARTBEAT + 0.05:
             found.append(f"under power for {own:.3f} s without its host")
+    unseen = watch.unseen.get(ARM, watch.farthest[ARM])
+    if expected.unseen is not None and result.code and unseen > expected.unseen:
+        found.append(f"its motor went {unseen:.4f} rad unseen, {expected.unseen:g} are allowed")
     farthest = max(watch.farthest.values(), default=0.0)
     if expected.farthest is not None and result.code and farthest > expected.farthest:
         found.append(f"a motor went {farthest:.2f} rad, {expected.farthest:g} rad are allowed")

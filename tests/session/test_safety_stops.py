@@ -74,7 +74,7 @@ MID_SWEEP = [
     (PowerLoss(TABLE), "table: node 11 left NMT operational (it rebooted)", "supply", 3),
     (NoMoreHeartbeats(ARM), "arm: node 12 sent no heartbeat for 0.35 s", "supply", 355),
     (Pushed(TABLE, 20.0), "table: ", "above the limit", 3),
-    (EncoderStuck(TABLE), "table: does not move at all", "Does the encoder count", 100),
+    (EncoderStuck(TABLE), "table: stands ", "its encoder does not count", 100),
     (MotorReversed(TABLE), "table: ", "", 400),
 ]
 

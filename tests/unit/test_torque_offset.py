@@ -1,6 +1,6 @@
 """Blocks of targets with torque offsets: rounded to the drive's units, refused above a limit."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from drives.api import AxisLimits, Capture, Targets, joined
 from drives.canopen_drive.channel import channel_of
 from drives.canopen_drive.outputs import OUTPUT_ROW, outputs_of
+from drives.canopen_drive.unseen import Learned
 from drives.errors import SafetyStopError
 from drives.profile import DriveProfile, load_drive
 from drives.units import AxisScaling
@@ -26,10 +27,11 @@ class FakeDrive:
     node_id: int = 5
     position_unit: str = "rad"
     torque_unit: str = "N m"
+    learned: Learned = field(default_factory=Learned)
 
     @property
     def axis_profile(self):
-        return SimpleNamespace(prior=SimpleNamespace(masses=(0.02,)))
+        return SimpleNamespace(prior=SimpleNamespace(masses=(0.02,), springs=()))
 
 
 def channel(name="x", rated=4.0, limit=6.0, takes_offset=True):

@@ -1,0 +1,178 @@
+"""Motion that an encoder does not show, on a motor of Newton's and Coulomb's laws with a cascade.
+
+The motor, its friction and its loop are integrated here in SI, in small steps; the watch sees counts and
+per mille of torque, once a cycle.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+
+from drives.canopen_drive.unseen import LEAST_UNITS, Learned, Unseen
+
+CYCLE, INNER = 0.002, 16
+INERTIA, LIMIT, RATED = 0.04, 6.0, 4.0
+UNIT = RATED / 1000
+WINDOW = np.radians(30)
+
+
+@dataclass
+class Motor:
+    """A motor with dry friction under a position loop, which sees only its encoder."""
+
+    counts: float
+    """A turn."""
+    friction: float
+    weight: float = 0.0
+    position_p: float = 15.0
+    velocity_p: float = 2.0
+    velocity_i: float = 15.0
+    angle: float = 0.0
+    speed: float = 0.0
+    stuck_at: int | None = None
+    sum: float = 0.0
+    torque: float = 0.0
+    _before: int = 0
+    _filtered: float = 0.0
+    rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(1))
+
+    def __post_init__(self) -> None:
+        self.sum = self.weight
+        self._before = self.encoder
+
+    @property
+    def scale(self) -> float:
+        return 2 * np.pi / self.counts
+
+    @property
+    def encoder(self) -> int:
+        return self.stuck_at if self.stuck_at is not None else round(self.angle / self.scale)
+
+    def cycle(self, target: float) -> tuple[int, int]:
+        """Let a cycle pass; return what the drive shows then."""
+        step = CYCLE / INNER
+        for _ in range(INNER):
+            now = self.encoder
+            self._filtered += 0.2 * ((now - self._before) * self.scale / step - self._filtered)
+            self._before = now
+            error = self.position_p * (target - now * self.scale) - self._filtered
+            self.sum += step * self.velocity_i * error
+            self.torque = float(np.clip(self.velocity_p * error + self.sum, -LIMIT, LIMIT))
+            self._move(self.torque - self.weight, step)
+        noise = self.rng.normal(0.0, 0.002)
+        return self.encoder, round((self.torque + noise) / UNIT)
+
+    def _move(self, pushed: float, step: float) -> None:
+        """Stick or slide."""
+        if self.speed == 0 and abs(pushed) <= self.friction:
+            return
+        way = np.sign(self.speed) if self.speed else np.sign(pushed)
+        speed = self.speed + step * (pushed - way * self.friction) / INERTIA
+        self.speed = 0.0 if self.speed * speed < 0 else speed
+        self.angle += step * self.speed
+
+
+def watch_of(motor: Motor, learned: Learned | None = None, prior: float = INERTIA) -> Unseen:
+    push = UNIT / prior * CYCLE**2 / motor.scale
+    floor = 2 + 0.03 * LIMIT / UNIT
+    return Unseen(learned or Learned(), push, round(WINDOW / motor.scale), floor, CYCLE)
+
+
+def pulses(motor: Motor, watch: Unseen) -> None:
+    """Push it out of rest, harder and harder, and nudge it: what comes before every measurement."""
+    for _ in range(60):
+        watch.take(*motor.cycle(0.0))
+    for size in (0.02, 0.05, 0.1, 0.2, 0.3):
+        for row in range(12):
+            motor.sum += size * LIMIT * np.sin(2 * np.pi * row / 12)
+            shown = motor.cycle(0.0)
+            motor.sum -= size * LIMIT * np.sin(2 * np.pi * row / 12)
+            watch.take(*shown)
+    nudge = 0.04 * np.sin(np.linspace(0, np.pi, 600)) ** 2
+    for target in np.concatenate([np.zeros(100), nudge, np.zeros(100)]):
+        watch.take(*motor.cycle(float(target)))
+
+
+def sweep(rng: np.random.Generator, rows: int, size: float) -> np.ndarray:
+    """Return a sum of sines that fades in."""
+    time = np.arange(rows) * CYCLE
+    rows_in = np.minimum(time / 0.3, 1.0)
+    sines = [
+        np.sin(2 * np.pi * f * time + rng.uniform(0, 2 * np.pi)) / f for f in rng.uniform(1, 12, 5)
+    ]
+    return size * rows_in * np.sum(sines, axis=0)
+
+
+@pytest.mark.parametrize("counts", [4000, 60_000, 2**20])
+@pytest.mark.parametrize("friction", [0.0, 0.2, 1.2])
+def test_a_sound_axis_is_no_alarm(fresh_rng, counts, friction):
+    """Whatever it does, at rest and in sweeps; its prior inertia may be wrong by a factor of two."""
+    motor = Motor(counts, friction, weight=float(fresh_rng.uniform(-0.5, 0.5)))
+    watch = watch_of(motor, prior=INERTIA * float(fresh_rng.choice([0.5, 1.0, 2.0])))
+    pulses(motor, watch)
+    for target in sweep(fresh_rng, 3000, float(fresh_rng.uniform(0.02, 0.3))):
+        watch.take(*motor.cycle(target))
+        assert not watch.alarm
+
+
+@pytest.mark.parametrize("counts", [8000, 60_000, 2**20])
+@pytest.mark.parametrize("friction", [0.0, 1.2])
+def test_a_stuck_encoder_is_found_before_it_has_gone_far(fresh_rng, counts, friction):
+    motor = Motor(counts, friction)
+    watch = watch_of(motor)
+    pulses(motor, watch)
+    when = int(fresh_rng.integers(400, 1200))
+    gone = None
+    for row, target in enumerate(sweep(fresh_rng, 3000, 0.3)):
+        if row == when:
+            motor.stuck_at, before = motor.encoder, motor.angle
+        watch.take(*motor.cycle(target))
+        if watch.alarm:
+            gone = abs(motor.angle - before)
+            break
+    assert gone is not None, "it was never found"
+    assert row >= when
+    allowed = max(16 * LEAST_UNITS * motor.scale, np.radians(4.0))  # 23 degrees with 8000 counts
+    assert gone < allowed, f"{watch.alarm}: {np.degrees(gone):.2f} degrees"
+
+
+def test_an_axis_that_stops_dead_at_speed_is_found_in_two_cycles(fresh_rng):
+    motor = Motor(2**20, 0.0)
+    watch = watch_of(motor)
+    pulses(motor, watch)
+    rows = 0
+    for target in sweep(fresh_rng, 2000, 0.3):
+        watch.take(*motor.cycle(target))
+        if motor.stuck_at is not None:
+            rows += 1
+            if watch.alarm:
+                break
+        elif abs(motor.speed) > 0.5 and watch._learned.samples > 300:
+            motor.stuck_at = motor.encoder
+    assert (watch.alarm, rows) == ("dead", 2)
+
+
+def test_nothing_is_judged_across_a_pause():
+    motor = Motor(2**20, 0.0)
+    watch = watch_of(motor)
+    pulses(motor, watch)
+    position, torque = motor.cycle(0.0)
+    for k in range(50):
+        watch.take(position + 100 * k, torque)
+    watch.restart()
+    for _ in range(5):
+        watch.take(position + 5000, torque)
+    assert not watch.alarm
+
+
+def test_what_was_learned_lasts_from_motion_to_motion():
+    """And what belongs to a cycle time goes with it."""
+    learned = Learned()
+    motor = Motor(2**20, 0.6)
+    pulses(motor, watch_of(motor, learned))
+    assert 0.8 * 0.6 / UNIT <= learned.friction < 3 * 0.6 / UNIT
+    assert learned.samples
+    Unseen(learned, 1.0, 1000, 10.0, 2 * CYCLE)
+    assert (learned.samples, learned.change) == (0, 0)
+    assert learned.friction > 0
