@@ -2,12 +2,11 @@
 
 from collections.abc import Sequence
 
-import typer
 from rich.console import Console
 
 from drives.errors import UserStopError
 from drives.parameters import Change
-from fieldtool.cli.output import told
+from fieldtool.cli.output import confirmed
 from fieldtool.cli.screen import parameter_table_of
 from fieldtool.cli.stop_key import StopKey, somebody_there
 from fieldtool.errors import PlanRefusedError
@@ -41,8 +40,7 @@ class WriteQuestion:
                 "asking. Nothing was written."
             )
         where = "working memory, and store them" if self._store else "working memory (not stored)"
-        question = told(f"Write these parameters into the drives' {where}?")
-        self.refused = not typer.confirm(question, err=True)
+        self.refused = not confirmed(f"Write these parameters into the drives' {where}?")
         return not self.refused
 
     def end(self) -> None:

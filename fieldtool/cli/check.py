@@ -11,7 +11,7 @@ from rich.text import Text
 
 from fieldtool import workflow
 from fieldtool.cli.bus_options import Bitrate, Channel, Interface, on_bus
-from fieldtool.cli.output import Json, console_of, print_json, told
+from fieldtool.cli.output import Json, confirmed, console_of, print_json
 from fieldtool.cli.sheet import Sheet
 from fieldtool.cli.stop_key import somebody_there, stop_key
 from fieldtool.cli.tracing import TraceFile, TraceWanted, trace_path
@@ -64,12 +64,9 @@ def check(
         if not somebody_there():
             return False
         axes = ", ".join(f"{a.name} by {way_of(a):.2g} {unit_of(a)}" for a in profile.axes)
-        return typer.confirm(
-            told(
-                f"Now every axis is enabled and moves a little and back: {axes}. Keep clear of the "
-                "machine.\nMove the axes now?"
-            ),
-            err=True,
+        return confirmed(
+            f"Now every axis is enabled and moves a little and back: {axes}. Keep clear of the "
+            "machine.\nMove the axes now?"
         )
 
     with stop_key() as key:

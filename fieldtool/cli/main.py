@@ -11,7 +11,23 @@ import traceback
 from collections.abc import Sequence
 from contextlib import suppress
 from datetime import datetime
+from errno import (
+    EACCES,
+    EDQUOT,
+    EFBIG,
+    EINVAL,
+    EIO,
+    EISDIR,
+    ELOOP,
+    ENAMETOOLONG,
+    ENOSPC,
+    ENOTDIR,
+    EPERM,
+    EROFS,
+)
+from io import TextIOWrapper
 from pathlib import Path
+from typing import NoReturn
 
 import typer
 from threadpoolctl import threadpool_limits
@@ -31,7 +47,7 @@ from fieldtool.cli.check import check
 from fieldtool.cli.criticise import criticise
 from fieldtool.cli.design import design
 from fieldtool.cli.identify import compare, identify
-from fieldtool.cli.output import told
+from fieldtool.cli.output import drop_output, told
 from fieldtool.cli.profile import profile_app
 from fieldtool.cli.recordings import export, import_
 from fieldtool.cli.replay import replay_command
@@ -77,6 +93,12 @@ EXIT_CODES: tuple[tuple[type[Exception], int], ...] = (
     (DrivesError, 3),
 )
 
+NAMED_BADLY = {ENAMETOOLONG, EACCES, EPERM, ELOOP, ENOTDIR, EISDIR, EINVAL}
+"""What the operating system says of a name that was given, or of the rights to what it names."""
+NO_ROOM = {ENOSPC, EDQUOT, EFBIG, EROFS, EIO}
+"""What it says of a place where nothing can be written."""
+LONGEST_NAME = 80
+
 app.command()(run)
 app.command()(demo)
 app.command()(measure)
@@ -104,6 +126,9 @@ def exit_code(error: BaseException) -> int:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run a command; errors become one sentence on standard error and an exit code."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):  # what its encoding has no letters for, become marks
+            stream.reconfigure(errors="replace")
     try:
         # matrices here are small: threads of linear algebra only stand in each other's way
         with threadpool_limits(limits=1):
@@ -115,12 +140,25 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except KeyboardInterrupt:
         _tell("stopped by the user")
         sys.exit(130)
+    except OSError as error:
+        known = NAMED_BADLY | NO_ROOM if error.filename is not None else {ENOSPC}
+        if error.errno not in known:
+            _defect(error)
+        where = "the output" if error.filename is None else str(error.filename)
+        drop_output()
+        _tell(f"{where[:LONGEST_NAME]}: {error.strerror}")
+        sys.exit(2 if error.errno in NAMED_BADLY else 3)
     except Exception as error:  # a defect of the tool: still one sentence, and nothing lost
-        _tell(
-            f"unexpected {type(error).__name__}: {error}. If axes were moving, they were stopped. "
-            f"This is a defect of fieldtool; please report it{_kept(traceback.format_exc())}"
-        )
-        sys.exit(1)
+        _defect(error)
+
+
+def _defect(error: Exception) -> NoReturn:
+    """Say that the tool has a defect, and keep its details."""
+    _tell(
+        f"unexpected {type(error).__name__}: {error}. If axes were moving, they were stopped. "
+        f"This is a defect of fieldtool; please report it{_kept(traceback.format_exc())}"
+    )
+    sys.exit(1)
 
 
 def _tell(sentence: str) -> None:

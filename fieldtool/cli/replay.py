@@ -1,7 +1,6 @@
 """``fieldtool replay``: a session shown again from its trace, without drives."""
 
 import sys
-from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,7 +11,7 @@ from rich.text import Text
 from drives.objects import ObjectAddress
 from drives.profile import MachineProfile
 from drives.replay import Decoded
-from fieldtool.cli.output import Json, console_of, indented, print_json
+from fieldtool.cli.output import Json, console_of, indented, print_json, put
 from fieldtool.cli.screen import TerminalScreen
 from fieldtool.cli.sheet import Sheet
 from fieldtool.cli.stop_key import stop_key
@@ -135,8 +134,7 @@ class _Listed:
         if self._as_json:
             self.rows.append(_row(frame, seconds))
         else:
-            with suppress(BrokenPipeError):
-                sys.stdout.write(self._line(frame, seconds))
+            put(self._line(frame, seconds))
 
     def _line(self, frame: Decoded, seconds: float) -> str:
         who = str(frame.node) if frame.node else ""

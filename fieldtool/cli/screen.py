@@ -312,7 +312,7 @@ def show_result(console: Console, result: SessionResult, *, listed: bool = False
     """Show the parameters, unless they were listed just now, and where everything is."""
     if result.write_back is not None:
         if not listed:
-            console.print("\n[bold]Controller parameters[/bold]")
+            console.print(Text("\nController parameters", style="bold"))
         show_parameters(console, result.write_back, listed=listed)
         if not result.write_back.in_memory:
             command = f"`fieldtool write {result.folder}`"

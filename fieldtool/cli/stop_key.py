@@ -7,11 +7,9 @@ from contextlib import contextmanager, suppress
 from time import monotonic
 from types import FrameType
 
-import typer
-
 from drives.canopen_drive.interrupts import SIGNALS
 from drives.errors import UserStopError
-from fieldtool.cli.output import told
+from fieldtool.cli.output import confirmed
 from fieldtool.errors import PlanRefusedError
 
 ASKED_WITHIN = 0.5
@@ -87,7 +85,7 @@ def may_move(yes: bool) -> Callable[[str], bool] | None:
                 "there is nobody to ask before the machine moves. Use --yes to move it without asking. "
                 "Nothing was moved."
             )
-        return typer.confirm(told(f"{sentence}\nMove the machine now?"), err=True)
+        return confirmed(f"{sentence}\nMove the machine now?")
 
     return ask
 
