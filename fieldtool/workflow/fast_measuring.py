@@ -45,7 +45,7 @@ TOLERATED = 1.05
 """Excitation time over what was asked for, above which it is said."""
 LATE_SHARE = 0.01
 """Of the pilot's cycles that may begin late; with more, the next longer cycle is tried."""
-FOLLOWING_ERROR = 4
+TORQUE, FOLLOWING_ERROR = 3, 4
 """Among an experiment's peaks."""
 SEED = 22
 """Of the random phases: the same machine gets the same plan."""
@@ -242,9 +242,30 @@ class FastMeasurement:
             self._offsets,
             session.screen.doing,
         )
+        if found.friction is None:
+            main = self._gentler(main, recording, pilot)
         main = freed_of_friction(main, now_known, found.noise, found.friction)
         for note in main.plan.notes:
             session.screen.say(note)
         main = replace(main, rests_on="pilot's model")
         session.screen.fast_plan(main)
         return main, now_known
+
+    def _gentler(
+        self, main: PlannedFast, recording: Recording, pilot: MultisinePlan
+    ) -> PlannedFast:
+        """Return a plan that rests on a model which does not explain the pilot, so much weaker.
+
+        By what axes' torques were in the pilot, over what that model had foreseen.
+        """
+        foreseen = experiment_peaks(pilot, self._setting)[:, TORQUE, :].max(axis=0)
+        done = [e for e in recording.experiments if e.kind == "multisine" and e.complete]
+        taken = np.max([np.abs(e.torque - e.torque.mean(axis=0)).max(axis=0) for e in done], axis=0)
+        more = float(np.max(taken / foreseen))
+        if more <= 1.0:
+            return main
+        self._session.warn(
+            f"In the pilot the torques went up to {more:.3g} times what the model says: the main "
+            "experiments are made so much weaker."
+        )
+        return replace(main, plan=main.plan.scaled(1 / more))
