@@ -2,9 +2,10 @@
 
 import json
 import signal
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.resources import files
 
+import numpy as np
 import pytest
 import yaml
 
@@ -182,6 +183,33 @@ def test_feed_forward_is_off_while_it_measures_and_put_back(make_bench, monkeypa
     assert bench.changed() == {}
     assert node.memory.stored == {}
     assert bench.powered() == {}
+
+
+# --- a pilot that nothing explains ---------------------------------------------------------------
+
+
+def test_a_plan_on_a_model_that_does_not_explain_the_pilot_is_weaker(make_bench, monkeypatch):
+    """An arm three times as heavy as the profile says: by its model the plan would pass the limit."""
+    machine = turntable()
+    machine["simulation"]["axes"][1]["masses"] = [0.12]
+    bench = make_bench(machine)
+    read_pilot = fast_measuring.read_pilot
+
+    def unexplained(recording, prior):
+        return replace(read_pilot(recording, prior), model=prior, friction=None)
+
+    monkeypatch.setattr(fast_measuring, "read_pilot", unexplained)
+    outcome = fast(bench, "measure")
+    assert outcome.code == 0, outcome.err
+    said = " ".join(outcome.out.split())
+    more = float(said.split("In the pilot the torques went up to ")[1].split()[0])
+    assert more > 1.3
+    experiments = bench.recording().experiments
+    taken = {
+        part: max(np.abs(e.torque[:, 1]).max() for e in experiments if e.name.startswith(part))
+        for part in ("pilot", "fast")
+    }
+    assert taken["pilot"] < taken["fast"] < 0.9 * 6.0
 
 
 # --- dry friction --------------------------------------------------------------------------------
