@@ -1,19 +1,33 @@
 """What one drive's units are worth: read from the drive as its profile says, or refused."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 from drives import objects
 from drives.errors import NotSupportedError
 from drives.objects import ObjectAddress, ObjectInfo
-from drives.profile import TorqueScale
+from drives.profile import AxisProfile, DriveProfile, TorqueScale
 from drives.units import AxisScaling, position_factor, velocity_factor
-
-if TYPE_CHECKING:
-    from drives.canopen_drive.drive import CanopenDrive
 
 FEWEST_COUNTS = 16
 """Increments a revolution below which nobody told the drive its encoder: a new one says 1/1."""
+
+
+class Asked(Protocol):
+    """What has to be known of a drive, and asked of it."""
+
+    profile: DriveProfile
+
+    @property
+    def axis(self) -> str:
+        """Name of the axis."""
+
+    @property
+    def axis_profile(self) -> AxisProfile:
+        """What the machine profile says of the axis."""
+
+    def read_optional(self, info: ObjectInfo) -> int | None:
+        """Return an object's value, None if the drive has no such object."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +41,7 @@ class Scaled:
     """Position units per motor revolution."""
 
 
-def read_scaling(drive: "CanopenDrive") -> Scaled:
+def read_scaling(drive: Asked) -> Scaled:
     """Read what the drive's position, velocity and torque units are worth.
 
     Raises
@@ -48,7 +62,7 @@ def read_scaling(drive: "CanopenDrive") -> Scaled:
     return Scaled(AxisScaling(position, velocity, rated / 1000), rated, counts / revolutions)
 
 
-def _rated_torque(drive: "CanopenDrive") -> float:
+def _rated_torque(drive: Asked) -> float:
     scale = drive.profile.torque
     if isinstance(scale, str) or isinstance(scale.scale, str):
         raise NotSupportedError(
@@ -68,7 +82,7 @@ def _rated_torque(drive: "CanopenDrive") -> float:
     return value if scale.unit == "N m" else value * _torque_constant(drive, scale)
 
 
-def _torque_constant(drive: "CanopenDrive", scale: TorqueScale) -> float:
+def _torque_constant(drive: Asked, scale: TorqueScale) -> float:
     if isinstance(scale.constant, ObjectAddress):
         info = ObjectInfo(scale.constant, "UNSIGNED32", "torque constant")
         value = drive.read_optional(info)
@@ -89,7 +103,7 @@ def _torque_constant(drive: "CanopenDrive", scale: TorqueScale) -> float:
     return constant
 
 
-def _resolution(drive: "CanopenDrive") -> tuple[int, int]:
+def _resolution(drive: Asked) -> tuple[int, int]:
     """Return increments, and the motor revolutions that they are for."""
     given, scale = drive.axis_profile.encoder_counts_per_rev, drive.profile.position
     told: int | None = None
@@ -119,7 +133,7 @@ def _resolution(drive: "CanopenDrive") -> tuple[int, int]:
     return told, revolutions
 
 
-def _velocity(drive: "CanopenDrive", position: float, counts: float) -> float:
+def _velocity(drive: Asked, position: float, counts: float) -> float:
     """Return rad/s per velocity unit; NaN where nobody knows, since nothing moves by it."""
     unit = drive.profile.velocity
     if unit == "unknown":
@@ -133,7 +147,7 @@ def _velocity(drive: "CanopenDrive", position: float, counts: float) -> float:
         raise NotSupportedError(f"{drive.axis}: velocity has no scale: {error}.") from None
 
 
-def _refuse_user_units(drive: "CanopenDrive", counts: int, revolutions: int) -> None:
+def _refuse_user_units(drive: Asked, counts: int, revolutions: int) -> None:
     """Refuse a drive whose positions are not those of its motor, while its torques are.
 
     A gear (0x6091) or a feed constant (0x6092) puts positions on another side than torques; masses

@@ -1,15 +1,12 @@
 """Faults of a drive, its motor, its encoder and its supply."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from drives.sim.emergency import ErrorRegister
 from drives.sim.faults import Fault
 from drives.sim.memory import Bank
+from drives.sim.running import RunningMachine
 from drives.sim.state_machine import State, Status
-
-if TYPE_CHECKING:
-    from drives.sim.running import RunningMachine
 
 UNDER_VOLTAGE = 0x3220
 """Emergency error code: the DC link is under its lowest voltage."""
@@ -21,7 +18,7 @@ class EncoderJumps(Fault):
 
     counts: int = 2**17
 
-    def set(self, machine: "RunningMachine", *, present: bool) -> None:
+    def set(self, machine: RunningMachine, *, present: bool) -> None:
         """Let it jump, there or back."""
         axis = machine.node(self.node_id).axis
         machine.axes.shift_encoder(axis, self.counts if present else -self.counts)
@@ -33,7 +30,7 @@ class TorqueScaleWrong(Fault):
 
     factor: float = 10.0
 
-    def set(self, machine: "RunningMachine", *, present: bool) -> None:
+    def set(self, machine: RunningMachine, *, present: bool) -> None:
         """Spoil or mend the scale."""
         axis = machine.node(self.node_id).axis
         machine.axes.scale_torque_reading(axis, self.factor if present else 1.0)
@@ -43,7 +40,7 @@ class TorqueScaleWrong(Fault):
 class BrakeClosed(Fault):
     """A brake, or an obstacle, holds the motor where it is; the drive does not know."""
 
-    def set(self, machine: "RunningMachine", *, present: bool) -> None:
+    def set(self, machine: RunningMachine, *, present: bool) -> None:
         """Close or open it."""
         machine.axes.hold_motor(machine.node(self.node_id).axis, defect=present)
 
@@ -57,7 +54,7 @@ class SupplySags(Fault):
     delay: float = 0.005
     """s until the drive sees it."""
 
-    def set(self, machine: "RunningMachine", *, present: bool) -> None:
+    def set(self, machine: RunningMachine, *, present: bool) -> None:
         """Let it sag; mended, the torque comes back, and the fault waits for its reset."""
         node = machine.node(self.node_id)
         limit = node.dictionary.read(0x6072, 0)
@@ -72,7 +69,7 @@ class SupplySags(Fault):
 class OperationLost(Fault):
     """The drive leaves operation enabled by itself, without an emergency (its enable input)."""
 
-    def set(self, machine: "RunningMachine", *, present: bool) -> None:
+    def set(self, machine: RunningMachine, *, present: bool) -> None:
         """Switch the power stage off."""
         if present:
             machine.node(self.node_id).motion.disable_voltage()
@@ -84,7 +81,7 @@ class ModeChanges(Fault):
 
     mode: int = 1
 
-    def set(self, machine: "RunningMachine", *, present: bool) -> None:
+    def set(self, machine: RunningMachine, *, present: bool) -> None:
         """Change it."""
         if present:
             machine.node(self.node_id).motion.set_mode(self.mode)
@@ -94,7 +91,7 @@ class ModeChanges(Fault):
 class LimitSwitchHit(Fault):
     """A limit switch stops the drive: it brakes by itself and shows an internal limit."""
 
-    def set(self, machine: "RunningMachine", *, present: bool) -> None:
+    def set(self, machine: RunningMachine, *, present: bool) -> None:
         """Hit it, or leave it."""
         motion = machine.node(self.node_id).motion
         motion.forced_bits = int(Status.INTERNAL_LIMIT) if present else 0
@@ -106,7 +103,7 @@ class LimitSwitchHit(Fault):
 class CanNotBeEnabled(Fault):
     """The drive stays in switched on, whatever it is told (its enable input is open)."""
 
-    def set(self, machine: "RunningMachine", *, present: bool) -> None:
+    def set(self, machine: RunningMachine, *, present: bool) -> None:
         """Open or close the input."""
         motion = machine.node(self.node_id).motion
         motion.enabling = not present
@@ -123,7 +120,7 @@ class PowerLossWhileStoring(Fault):
     bank: Bank = "old"
     """What its memory holds then: what was there before, what was to be stored, or neither."""
 
-    def set(self, machine: "RunningMachine", *, present: bool) -> None:
+    def set(self, machine: RunningMachine, *, present: bool) -> None:
         """Lie in wait, or not."""
         node = machine.node(self.node_id)
 
@@ -140,7 +137,7 @@ class TorqueLimited(Fault):
 
     share: float = 0.01
 
-    def set(self, machine: "RunningMachine", *, present: bool) -> None:
+    def set(self, machine: RunningMachine, *, present: bool) -> None:
         """Limit it, or not."""
         node = machine.node(self.node_id)
         limit = node.dictionary.read(0x6072, 0)

@@ -6,13 +6,10 @@ number acts (``machine.sync_count`` counts them); ``machine.lift(fault)`` ends i
 """
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from drives.sim.abort_codes import Abort
 from drives.sim.emergency import ErrorRegister
-
-if TYPE_CHECKING:
-    from drives.sim.running import RunningMachine
+from drives.sim.running import RunningMachine
 
 
 @dataclass(frozen=True)
@@ -21,11 +18,11 @@ class Fault:
 
     node_id: int
 
-    def check(self, machine: "RunningMachine") -> None:
+    def check(self, machine: RunningMachine) -> None:
         """Raise KeyError if the machine has no such node."""
         machine.node(self.node_id)
 
-    def set(self, machine: "RunningMachine", *, present: bool) -> None:
+    def set(self, machine: RunningMachine, *, present: bool) -> None:
         """Bring it about or end it."""
         raise NotImplementedError
 
@@ -34,7 +31,7 @@ class Fault:
 class NodeVanishes(Fault):
     """The node is off the bus: it hears nothing, sends nothing, and goes on by itself."""
 
-    def set(self, machine: "RunningMachine", *, present: bool) -> None:
+    def set(self, machine: RunningMachine, *, present: bool) -> None:
         """Pull the plug, or put it in."""
         machine.node(self.node_id).network.connect(not present)
 
@@ -50,7 +47,7 @@ class DriveFault(Fault):
     data: bytes = b""
     """At most five bytes of the manufacturer's."""
 
-    def set(self, machine: "RunningMachine", *, present: bool) -> None:
+    def set(self, machine: RunningMachine, *, present: bool) -> None:
         """Raise the error; only the host's fault reset ends it."""
         if present:
             machine.node(self.node_id).motion.fault(self.code, self.register, self.data)
@@ -65,7 +62,7 @@ class EmergencyOnly(Fault):
     register: int = int(ErrorRegister.TEMPERATURE)
     data: bytes = b""
 
-    def set(self, machine: "RunningMachine", *, present: bool) -> None:
+    def set(self, machine: RunningMachine, *, present: bool) -> None:
         """Report the error, or its end."""
         emergency = machine.node(self.node_id).emergency
         if present:
@@ -78,7 +75,7 @@ class EmergencyOnly(Fault):
 class NoTransmitPdos(Fault):
     """The node sends no TPDO; everything else works."""
 
-    def set(self, machine: "RunningMachine", *, present: bool) -> None:
+    def set(self, machine: RunningMachine, *, present: bool) -> None:
         """Mute or unmute."""
         machine.node(self.node_id).pdo.muted = present
 
@@ -91,7 +88,7 @@ class SdoRefused(Fault):
     subindex: int = 0
     code: int = int(Abort.GENERAL)
 
-    def set(self, machine: "RunningMachine", *, present: bool) -> None:
+    def set(self, machine: RunningMachine, *, present: bool) -> None:
         """Refuse or serve."""
         aborting = machine.node(self.node_id).sdo.aborting
         if present:
@@ -107,7 +104,7 @@ class SdoSilent(Fault):
     index: int
     subindex: int = 0
 
-    def set(self, machine: "RunningMachine", *, present: bool) -> None:
+    def set(self, machine: RunningMachine, *, present: bool) -> None:
         """Be silent or answer."""
         silent = machine.node(self.node_id).sdo.silent
         if present:
@@ -125,7 +122,7 @@ class WriteAltered(Fault):
     value: float = 0
     """What it keeps, raw."""
 
-    def set(self, machine: "RunningMachine", *, present: bool) -> None:
+    def set(self, machine: RunningMachine, *, present: bool) -> None:
         """Alter writes or take them as they are."""
         alterations = machine.node(self.node_id).dictionary.alterations
         if present:
@@ -140,7 +137,7 @@ class StoreFails(Fault):
 
     code: int = int(Abort.HARDWARE)
 
-    def set(self, machine: "RunningMachine", *, present: bool) -> None:
+    def set(self, machine: RunningMachine, *, present: bool) -> None:
         """Break or mend the memory."""
         machine.node(self.node_id).store_fails = self.code if present else None
 
@@ -149,7 +146,7 @@ class StoreFails(Fault):
 class StoreForgets(Fault):
     """0x1010 answers as if it had stored, and nothing is stored."""
 
-    def set(self, machine: "RunningMachine", *, present: bool) -> None:
+    def set(self, machine: RunningMachine, *, present: bool) -> None:
         """Break or mend the memory."""
         machine.node(self.node_id).store_forgets = present
 
@@ -158,7 +155,7 @@ class StoreForgets(Fault):
 class EncoderStuck(Fault):
     """The encoder stays where it is, for the loops and for the host."""
 
-    def set(self, machine: "RunningMachine", *, present: bool) -> None:
+    def set(self, machine: RunningMachine, *, present: bool) -> None:
         """Hold or let go."""
         machine.axes.hold_encoder(machine.node(self.node_id).axis, defect=present)
 
@@ -167,7 +164,7 @@ class EncoderStuck(Fault):
 class MotorReversed(Fault):
     """The motor turns against the torque asked for (swapped phases)."""
 
-    def set(self, machine: "RunningMachine", *, present: bool) -> None:
+    def set(self, machine: RunningMachine, *, present: bool) -> None:
         """Swap the phases, or swap them back."""
         machine.axes.reverse_motor(machine.node(self.node_id).axis, defect=present)
 
@@ -176,7 +173,7 @@ class MotorReversed(Fault):
 class PowerLoss(Fault):
     """The drive's supply fails for a moment: it boots, and what was not stored is gone."""
 
-    def set(self, machine: "RunningMachine", *, present: bool) -> None:
+    def set(self, machine: RunningMachine, *, present: bool) -> None:
         """Switch off and on again."""
         if present:
             machine.node(self.node_id).power_cycle()

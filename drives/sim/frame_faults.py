@@ -5,13 +5,11 @@ They act on the frames between nodes and host; the drives themselves are sound a
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 from drives.sim.faults import Fault
+from drives.sim.running import RunningMachine
 from drives.sim.wire import Sent, unchanged
-
-if TYPE_CHECKING:
-    from drives.sim.running import RunningMachine
 
 _UPLOAD_BEGUN, _SEGMENT, _DOWNLOAD_BEGUN, _ABORTED = 2, 0, 3, 4
 """Command specifiers of an SDO server (CiA 301, clause 7.2.4.3)."""
@@ -40,7 +38,7 @@ class FrameFault(Fault):
     times: float = float("inf")
     """How many frames it befalls."""
 
-    def set(self, machine: "RunningMachine", *, present: bool) -> None:
+    def set(self, machine: RunningMachine, *, present: bool) -> None:
         """Begin or end it."""
         if not present:
             machine.wire.from_nodes.pop(self, None)
@@ -60,7 +58,7 @@ class FrameFault(Fault):
         """Whether it befalls this frame."""
         raise NotImplementedError
 
-    def instead(self, machine: "RunningMachine", cob_id: int, data: bytes) -> tuple[Sent, ...]:
+    def instead(self, machine: RunningMachine, cob_id: int, data: bytes) -> tuple[Sent, ...]:
         """Return what goes out in its place."""
         raise NotImplementedError
 
@@ -73,7 +71,7 @@ class HeartbeatLost(FrameFault):
         """Heartbeats."""
         return cob_id == 0x700 + node_id
 
-    def instead(self, machine: "RunningMachine", cob_id: int, data: bytes) -> tuple[Sent, ...]:  # noqa: ARG002
+    def instead(self, machine: RunningMachine, cob_id: int, data: bytes) -> tuple[Sent, ...]:  # noqa: ARG002
         """Return nothing."""
         return ()
 
@@ -96,7 +94,7 @@ class SdoAnswerWrong(FrameFault):
             return False
         return self.index is None or data[1:3] == self.index.to_bytes(2, "little")
 
-    def instead(self, machine: "RunningMachine", cob_id: int, data: bytes) -> tuple[Sent, ...]:  # noqa: ARG002
+    def instead(self, machine: RunningMachine, cob_id: int, data: bytes) -> tuple[Sent, ...]:  # noqa: ARG002
         """Return the altered answer."""
         altered = bytearray(data)
         match self.how:
@@ -133,7 +131,7 @@ class SdoAnswerLate(FrameFault):
         """SDO answers."""
         return cob_id == 0x580 + node_id
 
-    def instead(self, machine: "RunningMachine", cob_id: int, data: bytes) -> tuple[Sent, ...]:  # noqa: ARG002
+    def instead(self, machine: RunningMachine, cob_id: int, data: bytes) -> tuple[Sent, ...]:  # noqa: ARG002
         """Return it for later."""
         return ((round(self.delay * 1e9), cob_id, data),)
 
@@ -151,7 +149,7 @@ class PdoFault(FrameFault):
 class PdoMissing(PdoFault):
     """It does not come."""
 
-    def instead(self, machine: "RunningMachine", cob_id: int, data: bytes) -> tuple[Sent, ...]:  # noqa: ARG002
+    def instead(self, machine: RunningMachine, cob_id: int, data: bytes) -> tuple[Sent, ...]:  # noqa: ARG002
         """Return nothing."""
         return ()
 
@@ -162,7 +160,7 @@ class PdoLate(PdoFault):
 
     cycles: float = 1.3
 
-    def instead(self, machine: "RunningMachine", cob_id: int, data: bytes) -> tuple[Sent, ...]:
+    def instead(self, machine: RunningMachine, cob_id: int, data: bytes) -> tuple[Sent, ...]:
         """Return it for later."""
         return ((round(self.cycles * machine.period), cob_id, data),)
 
@@ -171,7 +169,7 @@ class PdoLate(PdoFault):
 class PdoTwice(PdoFault):
     """It comes a second time."""
 
-    def instead(self, machine: "RunningMachine", cob_id: int, data: bytes) -> tuple[Sent, ...]:  # noqa: ARG002
+    def instead(self, machine: RunningMachine, cob_id: int, data: bytes) -> tuple[Sent, ...]:  # noqa: ARG002
         """Return it twice."""
         return ((0, cob_id, data), (0, cob_id, data))
 
@@ -182,7 +180,7 @@ class PdoShort(PdoFault):
 
     length: int = 6
 
-    def instead(self, machine: "RunningMachine", cob_id: int, data: bytes) -> tuple[Sent, ...]:  # noqa: ARG002
+    def instead(self, machine: RunningMachine, cob_id: int, data: bytes) -> tuple[Sent, ...]:  # noqa: ARG002
         """Return its first bytes."""
         return ((0, cob_id, data[: self.length]),)
 
@@ -191,7 +189,7 @@ class PdoShort(PdoFault):
 class StatuswordFrozen(PdoFault):
     """The statusword in the PDO stays what it is when the fault begins."""
 
-    def set(self, machine: "RunningMachine", *, present: bool) -> None:
+    def set(self, machine: RunningMachine, *, present: bool) -> None:
         """Freeze or thaw it."""
         if not present:
             machine.wire.from_nodes.pop(self, None)
@@ -213,7 +211,7 @@ class SyncMissed(Fault):
 
     times: float = 1
 
-    def set(self, machine: "RunningMachine", *, present: bool) -> None:
+    def set(self, machine: RunningMachine, *, present: bool) -> None:
         """Deafen it or not."""
         machine.syncs_missed[self.node_id] = self.times if present else 0
 
@@ -226,7 +224,7 @@ class NodeDuplicated(FrameFault):
         """Everything that a node sends but emergencies."""
         return cob_id - node_id in (0x180, 0x580, 0x700)
 
-    def instead(self, machine: "RunningMachine", cob_id: int, data: bytes) -> tuple[Sent, ...]:  # noqa: ARG002
+    def instead(self, machine: RunningMachine, cob_id: int, data: bytes) -> tuple[Sent, ...]:  # noqa: ARG002
         """Return what both send."""
         other = bytearray(data)
         if cob_id < 0x580 and len(data) == 8:
@@ -246,7 +244,7 @@ class Stranger(Fault):
     """s; from the moment of the fault on."""
     times: float = float("inf")
 
-    def set(self, machine: "RunningMachine", *, present: bool) -> None:
+    def set(self, machine: RunningMachine, *, present: bool) -> None:
         """Let him in, or send him away."""
         if not present:
             machine.wire.to_nodes.pop(self, None)

@@ -1,14 +1,11 @@
 """Faults of the host and its CAN adapter, as the simulated bus shows them to it."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from drives.sim.faults import Fault
+from drives.sim.running import RunningMachine
 from drives.sim.scheduler import nanoseconds
 from drives.sim.wire import Adapter
-
-if TYPE_CHECKING:
-    from drives.sim.running import RunningMachine
 
 
 @dataclass(frozen=True)
@@ -17,14 +14,14 @@ class HostFault(Fault):
 
     node_id: int = 0
 
-    def check(self, machine: "RunningMachine") -> None:
+    def check(self, machine: RunningMachine) -> None:
         """Nothing has to be there."""
 
     def adapter(self) -> Adapter:
         """Return the adapter with its defect."""
         raise NotImplementedError
 
-    def set(self, machine: "RunningMachine", *, present: bool) -> None:
+    def set(self, machine: RunningMachine, *, present: bool) -> None:
         """Spoil the adapter, or mend it."""
         machine.adapter = self.adapter() if present else Adapter()
 

@@ -7,8 +7,8 @@ time pass with :meth:`RunningMachine.advance_to`.
 
 from collections.abc import Callable
 from functools import partial
+from typing import Protocol
 
-from drives.sim.faults import Fault
 from drives.sim.firmware import SimulatedAxes
 from drives.sim.machine import SimulatedMachine
 from drives.sim.node import DriveNode
@@ -28,6 +28,16 @@ Listener = Callable[[int, int, bytes], None]
 
 class CycleTimeError(ValueError):
     """The nodes' communication cycles do not agree, or the drives can not keep them."""
+
+
+class Defect(Protocol):
+    """What can befall a machine (``drives.sim.faults``)."""
+
+    def check(self, machine: "RunningMachine") -> None:
+        """Raise KeyError if it can not befall this machine."""
+
+    def set(self, machine: "RunningMachine", *, present: bool) -> None:
+        """Bring it about or end it."""
 
 
 class RunningMachine:
@@ -61,7 +71,7 @@ class RunningMachine:
         self._next_task = TASK_PERIOD
         self._listeners: tuple[Listener, ...] = ()
         self._switchboard = Switchboard()
-        self._sync_faults: dict[int, list[Fault]] = {}
+        self._sync_faults: dict[int, list[Defect]] = {}
         self._by_sync: dict[int, list[DriveNode]] | None = None
         self._period: int | None = None
         self.nodes: tuple[DriveNode, ...] = ()
@@ -258,7 +268,7 @@ class RunningMachine:
     # -- faults -----------------------------------------------------------------------------------
 
     def inject(
-        self, fault: Fault, *, at_time: float | None = None, at_sync: int | None = None
+        self, fault: Defect, *, at_time: float | None = None, at_sync: int | None = None
     ) -> None:
         """Bring a fault about: at once, at a virtual time (s), or right before a SYNC acts.
 
@@ -286,6 +296,6 @@ class RunningMachine:
         else:
             fault.set(self, present=True)
 
-    def lift(self, fault: Fault) -> None:
+    def lift(self, fault: Defect) -> None:
         """End a fault."""
         fault.set(self, present=False)

@@ -21,7 +21,7 @@ from fieldtool.writeback.tool_sets import (
     tool_sets,
     tools_folder,
 )
-from fieldtool.writeback.transaction import WriteBack, apply_changes
+from fieldtool.writeback.transaction import WriteBack, apply
 from fieldtool.writeback.unfinished import refuse_unfinished
 
 
@@ -127,7 +127,7 @@ def switch_tool(
             )
         changes = changes_to(group.drives, tool, same_drives=same_drives)
         session.screen.stage(f"Write the parameters of tool set {name}, and read them back")
-        result = apply_changes(
+        result = apply(
             profile.name,
             group.drives,
             changes,

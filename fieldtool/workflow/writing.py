@@ -97,7 +97,7 @@ def written(
         result = apply(
             session.machine.name,
             group.drives,
-            tuning,
+            changes_for(group.drives, tuning),
             session.folder.parameters_before,
             agreed,
             options.store,

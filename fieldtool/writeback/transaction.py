@@ -84,7 +84,7 @@ def changes_for(drives: Sequence[CanopenDrive], tuning: Tuning) -> tuple[Change,
 def apply(
     machine: str,
     drives: Sequence[CanopenDrive],
-    tuning: Tuning,
+    changes: tuple[Change, ...],
     backup_path: Path,
     confirm: Confirm,
     keep: bool = False,
@@ -102,8 +102,8 @@ def apply(
         Name, for backup and journal.
     drives
         All drives of the machine, disabled.
-    tuning
-        New parameters.
+    changes
+        What is to be written, in the order of writing: :func:`changes_for`.
     backup_path
         File for the backup, written before the first change; see :func:`take_backup`.
     confirm
@@ -134,25 +134,6 @@ def apply(
     UserStopError
         If the user stopped: all drives hold their old values.
     """
-    refuse_unfinished(machine, drives, backup_path.parent)
-    changes = changes_for(drives, tuning)
-    return apply_changes(
-        machine, drives, changes, backup_path, confirm, keep, say, prove, stop_requested
-    )
-
-
-def apply_changes(
-    machine: str,
-    drives: Sequence[CanopenDrive],
-    changes: tuple[Change, ...],
-    backup_path: Path,
-    confirm: Confirm,
-    keep: bool = False,
-    say: Callable[[str], None] = lambda _: None,
-    prove: Callable[[], None] | None = None,
-    stop_requested: Callable[[], bool] = lambda: False,
-) -> WriteBack:
-    """Do the same as :func:`apply` with changes that are known already, in the order of writing."""
     refuse_unfinished(machine, drives, backup_path.parent)
     if keep:
         for drive in drives:
