@@ -40,7 +40,6 @@ def drive_loop(drive: CanopenDrive, servo: Servo) -> DriveLoop:
         unsure,
         0.0 if profile.interpolation == "linear" else timing.cycle,
         servo.torque_noise(abs(drive.scaling.position)),
-        abs(drive.scaling.position),
         _why_not_told(drive),
     )
 

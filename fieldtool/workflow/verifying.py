@@ -27,10 +27,10 @@ from fieldtool.design.verdict import Comparison, faults
 from fieldtool.errors import IdentificationError, OutputError
 from fieldtool.experiment.axes import Axes
 from fieldtool.experiment.verification.identity import IdentityWatch, Learned
-from fieldtool.experiment.verification.oscillation import HOLD_LEVEL
+from fieldtool.experiment.verification.oscillation import HOLD_LEVEL, LOUDEST
 from fieldtool.experiment.verification.trial import Tried, run_trial
 from fieldtool.experiment.verification.watch import Guards
-from fieldtool.experiment.verification.work import WorkWatch
+from fieldtool.experiment.verification.work import WorkRecord, WorkWatch
 from fieldtool.records.model import FloatArray, MachineModel
 from fieldtool.records.recording import Experiment, RecordingWriter
 from fieldtool.records.yaml_file import write_yaml
@@ -56,9 +56,8 @@ from fieldtool.workflow.trial_records import TrialRecords
 from fieldtool.workflow.verified import Verified
 from fieldtool.writeback.temporary import backed_up
 
-LOUDER, LOUDEST = 1.5, 4.0
-"""Times its swing with the old parameters by which a torque may swing at rest; and times the watch's
-usual level, at most."""
+LOUDER = 1.5
+"""Times its swing with the old parameters by which a torque may swing at rest."""
 
 
 class Verification:
@@ -101,6 +100,7 @@ class Verification:
         self._old: Tried | None = None
         self._identity: IdentityWatch | None = None
         self._learned: Learned | None = None
+        self._works = WorkRecord()
         self._recorder: RecordingWriter | None = None
         self._histories: list[tuple[Comparison, History, History]] = []
         self.result: Verified | None = None
@@ -234,16 +234,17 @@ class Verification:
     def _guards(self, servos: Sequence[Servo]) -> Guards:
         """Return what compares torques with these controllers; while the old ones act it only learns."""
         drives = self._group.drives
+        quanta = np.array([abs(drive.scaling.torque) for drive in drives])
         identity = IdentityWatch(
             [drive_loop(*pair) for pair in zip(drives, servos, strict=True)],
             self._planned.trial.cycle_time,
-            np.array([abs(drive.scaling.torque) for drive in drives]),
+            quanta,
             self._learned,
             [drive.torque_unit for drive in drives],
         )
         self._identity = identity
         if self._learned is None or self._old is None:
-            return Guards(identity)
+            return Guards(identity, self._works)
         for drive, why in zip(drives, identity.why_not, strict=True):
             if why:
                 self._session.warn(
@@ -251,13 +252,8 @@ class Verification:
                     f"not be told from its torque: {why}. Swings, ways and torques are watched as ever."
                 )
         limits = np.array([one.torque for one in self._axes.limits])
-        work = WorkWatch(
-            self._old.rest,
-            self._axes.counts,
-            limits,
-            self._axes.units,
-        )
-        return Guards(identity, work)
+        known = self._old.rest, self._axes.counts, limits, quanta, self._axes.units
+        return Guards(identity, WorkWatch(*known, self._works.most(WorkWatch(*known))))
 
     @contextmanager
     def _ready_to_excite(self, servos: Sequence[Servo]) -> Iterator[None]:

@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drives.api import AxisLimits
+from fieldtool.experiment.verification.hiss import hiss
 from fieldtool.experiment.verification.oscillation import (
     HOLD_LEVEL,
     HOLD_TURNS,
@@ -267,3 +268,24 @@ def test_the_frequency_is_told():
     told = float(alarm.sentence.split("about ")[1].split(" Hz")[0])
     assert told == pytest.approx(40, rel=0.15)
     assert HOLD_TURNS == 2
+
+
+def test_a_torque_that_hisses_is_no_swing_and_one_that_swings_is_no_hiss():
+    rng = np.random.default_rng(3)
+    time = np.arange(3000) * STEP
+    noise = 0.02 * LIMITS.torque * rng.standard_normal(3000)
+
+    def good():
+        one = watch()
+        return OscillationWatch(
+            ["x"], [LIMITS], np.array([1e-5]), np.array([STILL]), one._step, trusts_loops=True
+        )
+
+    assert first_alarm(good(), np.zeros(3000), noise) is None
+    assert hiss(noise[:100]) == pytest.approx(0.02 * LIMITS.torque, rel=0.3)
+    for frequency in (5.0, 20.0, 70.0, 160.0, 300.0, 410.0):
+        swing = 0.06 * LIMITS.torque * np.sin(2 * np.pi * frequency * time)
+        assert hiss(swing[:100]) == 0
+        found = first_alarm(good(), np.zeros(3000), swing)
+        assert found is not None
+        assert found * STEP < 0.1 + 3 / frequency

@@ -83,9 +83,7 @@ def filtered(one, state, value):
 
 def drive(loop, **changes):
     noise = Servo(loop, timing=Timing(LAG, PERIOD)).torque_noise(COUNT)
-    one = DriveLoop(
-        loop, period=PERIOD, lag=LAG + PERIOD / 2, unsure=0.1e-3, noise=noise, count=COUNT
-    )
+    one = DriveLoop(loop, period=PERIOD, lag=LAG + PERIOD / 2, unsure=0.1e-3, noise=noise)
     return replace(one, **changes)
 
 
@@ -226,7 +224,9 @@ def test_references_and_positions_are_two_parts_of_one_torque():
 
 
 def work(position, torque, rest=0.0):
-    one = WorkWatch(np.array([rest]), np.array([COUNT]), np.array([LIMIT]), ["rad"])
+    one = WorkWatch(
+        np.array([rest]), np.array([COUNT]), np.array([LIMIT]), np.array([1e-3 * LIMIT]), ["rad"]
+    )
     for n, (q, t) in enumerate(zip(position, torque, strict=True)):
         found = one.take([q], [t], fresh=True)
         if found:

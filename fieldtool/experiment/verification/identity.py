@@ -35,8 +35,6 @@ SHARE = 0.2
 """Of the torque that is expected by which it may differ."""
 REMEMBERED = 0.015
 """s, time constant with which what was expected is forgotten."""
-BUSY = 2.0
-"""Times the share of cycles in which an encoder counts that its steps make all their noise."""
 SEEN, OF = 5, 8
 """Differences above what is allowed, of so many cycles, that are enough."""
 GLARING, LATELY = 3.0, 0.05
@@ -116,9 +114,8 @@ class IdentityWatch:
         self._judged = [not why for why in self.why_not]
         late = np.array([loop.unsure for loop in loops])
         self._late = np.array([late + [loop.unsure_targets for loop in loops], late])
-        self._half = 0.5 * np.array([loop.count for loop in loops])
-        self._encoder = ENCODER * np.array([loop.noise for loop in loops])
-        self._floor = QUANTA * self._quanta
+        encoder = ENCODER * np.array([loop.noise for loop in loops])
+        self._floor = QUANTA * self._quanta + encoder
         self._scale = np.ones(len(loops))
         if learned is not None:
             self._floor = self._floor + STILL * learned.still
@@ -129,11 +126,25 @@ class IdentityWatch:
         """Another motion begins."""
         self._rows: list[tuple[FloatArray, FloatArray, FloatArray, FloatArray]] = []
         self._origin: FloatArray | None = None
+        self._count = 0
         self._blind = round(BLIND / self._step)
 
     def stand(self, *, still: bool) -> None:
         """Say whether all axes are told to stand still from now on."""
         self._standing = still
+
+    @property
+    def cleaned(self) -> tuple[list[float], list[float]] | None:
+        """Positions and torques one SYNC before the last, M values each; None where there are none yet.
+
+        Of axes that are judged what is quick in the torque is what is expected, so only slow noise is
+        left in it.
+        """
+        if self._count == 0:
+            return None
+        position, torque = self._rows[-LATE][:2]
+        expected = torque - self._quick[2] + self._quick[0] + self._quick[1]
+        return position.tolist(), np.where(self._judged, expected, torque).tolist()
 
     def learned(self) -> Learned:
         """Return what was seen so far."""
@@ -169,7 +180,7 @@ class IdentityWatch:
         self._before = np.zeros((3, m))
         self._before[2] = torque
         self._quick = np.zeros((3, m))
-        self._peak, self._slope, self._busy = np.zeros(m), np.zeros((2, m)), np.zeros(m)
+        self._peak, self._slope = np.zeros(m), np.zeros((2, m))
         self._over: list[FloatArray] = []
         self._far: list[FloatArray] = []
         self._glared = np.full(m, -np.inf)
@@ -191,28 +202,24 @@ class IdentityWatch:
         difference = np.abs(quick[2] - expected)
         self._peak = np.maximum(np.abs(expected), self._kept * self._peak)
         self._slope = np.maximum(slope, self._kept * self._slope)
-        counts = np.abs(rows[-LATE][0] - rows[-LATE - 1][0]) > self._half
-        self._busy = self._kept * self._busy + (1 - self._kept) * counts
         allowed = self._floor + SHARE * self._peak + (self._late * self._slope).sum(axis=0)
         if self._learned is None:
             allowed = allowed + STILL * self._still  # noise is no share of anything
         self._count += 1
         if self._count <= self._blind:
             return []
-        most = allowed + self._encoder
-        allowed = allowed + np.minimum(BUSY * self._busy, 1.0) * self._encoder
         self._over = [*self._over[1 - OF :], difference / allowed]
         self._far = [*self._far[1 - OF :], difference]
         if len(self._over) < SEEN:
             return []
-        return self._found(allowed, difference / most)
+        return self._found(allowed)
 
-    def _found(self, allowed: FloatArray, single: FloatArray) -> list[tuple[int, str]]:
+    def _found(self, allowed: FloatArray) -> list[tuple[int, str]]:
         over = np.sort(np.array(self._over), axis=0)[-SEEN]
         if self._learned is None:
             self._learn(over, np.sort(np.array(self._far), axis=0)[-SEEN])
             return []
-        glares = single > GLARING * self._scale
+        glares = self._over[-1] > GLARING * self._scale
         again = glares & (self._count - self._glared < LATELY / self._step)
         self._glared = np.where(glares, self._count, self._glared)
         return [

@@ -27,6 +27,7 @@ from math import isfinite
 import numpy as np
 
 from drives.api import Alarm, AxisLimits, FloatArray
+from fieldtool.experiment.verification.hiss import hiss
 from fieldtool.experiment.verification.swings import Swings
 
 HOLD_LEVEL, HOLD_TURNS = 0.08, 2
@@ -49,6 +50,14 @@ MOST_STEPS = 0.6
 """Share of the torque limit by which steps of the targets may make a torque swing, at most."""
 LONGEST_HALF = 0.25
 """Seconds from one turn to the next, at most."""
+SAGS = 2.0
+"""Times the usual way that axes may sag, as they take over their weights, under loops that are known to
+be good."""
+HEARD = 0.1
+"""s of the first standing still in which torques of loops that are known to be good are listened to."""
+HISS, LOUDEST = 9.0, 4.0
+"""Times its deviation by which noise may swing a torque, peak to peak; and times the usual level
+that is allowed for it, at most."""
 TORQUE_UNITS = {"rad": "N m", "m": "N"}
 REST_TIME = 0.05
 """Time constant with which the torque at rest is found, s."""
@@ -131,6 +140,7 @@ class OscillationWatch:
         self._trusts_loops = trusts_loops
         self._torques = [Swings() for _ in self._names]
         self._positions = [Swings() for _ in self._names]
+        self._heard: list[Sequence[float]] | None = [] if trusts_loops else None
         self._rest: list[float] = []
         self._allowed: Allowed | None = None
         self._since = 0
@@ -148,14 +158,33 @@ class OscillationWatch:
         for swings in (*self._torques, *self._positions):
             swings.restart(float("inf"))
 
+    @property
+    def _resting_louder(self) -> FloatArray:
+        return self._louder if self._heard is None else np.full(len(self._names), LOUDEST)
+
+    def _listen(self, torque: Sequence[float]) -> None:
+        """Hear how much torques hiss while all axes stand first; then the levels are what they need."""
+        if self._heard is None or self._allowed is None or not self._allowed.resting:
+            return
+        self._heard.append(torque)
+        if len(self._heard) < HEARD / self._step:
+            return
+        noise = np.array([hiss(own) for own in zip(*self._heard, strict=True)])
+        needed = HISS * noise / (HOLD_LEVEL * self._torque_limits)
+        self._louder = np.maximum(self._louder, np.minimum(needed, LOUDEST))
+        self._heard = None
+        level = self._louder * HOLD_LEVEL * self._torque_limits
+        self._allow(replace(self._allowed, torque_swing=level))
+
     def hold(self, at: FloatArray) -> None:
         """Allow no more than standing still at positions, shape (M,)."""
+        still = (SAGS if self._trusts_loops else 1.0) * self._still
         self._allow(
             Allowed(
-                at - self._still,
-                at + self._still,
+                at - still,
+                at + still,
                 self._torque_limits,
-                self._louder * HOLD_LEVEL * self._torque_limits,
+                self._resting_louder * HOLD_LEVEL * self._torque_limits,
                 self._position_swing / 2,
                 HOLD_TURNS,
                 growing=False,
@@ -277,6 +306,7 @@ class OscillationWatch:
             if (text := self._judge(k, position[k], torque[k], allowed))
         ]
         self._follow_rest(torque, allowed)
+        self._listen(torque)
         if not found:
             return None
         k, text = found[0]

@@ -69,7 +69,7 @@ class Tried:
     noise: FloatArray
     """Peak-to-peak torque of each axis while all stood still, shape (M,)."""
     rest: FloatArray
-    """Torque of each axis while all stood still before anything moved, shape (M,)."""
+    """Torque of each axis where it began, once all have come back there and rest, shape (M,)."""
 
     def move(self, axis: str) -> Experiment | None:
         """Return the move of an axis; None if there was none."""
@@ -90,6 +90,8 @@ def still_allowed(axes: Axes) -> FloatArray:
 
 
 NOBODY = Guards()
+REST_TIME = 0.2
+"""Seconds at the end of a move's record from which the torque at rest is taken."""
 
 
 def run_trial(
@@ -179,7 +181,8 @@ def run_trial(
     for experiment in kept:  # the disk may be slow: not while axes wait for their SYNC
         keep(experiment)
     noise = np.max([np.ptp(rest.torque[rest.rows // 2 :], axis=0) for rest in rests], axis=0)
-    rest = rests[0].torque[rests[0].rows // 2 :].mean(axis=0)
+    last = next((one.torque for one in reversed(kept) if one.kind == "moves"), rests[0].torque)
+    rest = last[-round(REST_TIME / trial.cycle_time) :].mean(axis=0)
     return Tried(tuple(kept), noise, rest)
 
 

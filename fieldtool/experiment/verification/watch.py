@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from drives.api import Alarm, FloatArray
 from fieldtool.experiment.verification.identity import IdentityWatch
 from fieldtool.experiment.verification.oscillation import OscillationWatch
-from fieldtool.experiment.verification.work import WorkWatch
+from fieldtool.experiment.verification.work import WorkRecord, WorkWatch
 
 
 @dataclass(frozen=True)
@@ -15,7 +15,7 @@ class Guards:
 
     identity: IdentityWatch | None = None
     """Whether drives' torques are those of their controllers."""
-    work: WorkWatch | None = None
+    work: WorkWatch | WorkRecord | None = None
     """Whether motors push the way they are asked to; while the axes hold still and are nudged."""
 
 
@@ -69,10 +69,12 @@ class TrialWatch:
             return alarm
         found: list[tuple[int, str]] = []
         guards = self._guards
+        seen: tuple[Sequence[float], Sequence[float]] | None = position, torque
         if guards.identity is not None:
             found += guards.identity.take(position, torque, target, offset, fresh=fresh)
-        if guards.work is not None and self._small:
-            found += guards.work.take(position, torque, fresh=fresh)
+            seen = guards.identity.cleaned
+        if guards.work is not None and self._small and seen is not None:
+            found += guards.work.take(*seen, fresh=fresh)
         if not found:
             return None
         k, text = found[0]

@@ -8,11 +8,12 @@ is at least zero, whatever its masses, springs, couplings and frictions are (it 
 that pushes against what its drive asks for, or an encoder that counts the other way, makes the told
 work of its axis negative from the first count on, and it grows with the square of the motion.
 
-What may be missing: positions are whole counts, which by summation by parts is half a count times all
-that the torque goes up and down; and for the torque at rest, which is known from a trial before, UNSURE
-of the torque limit times the way.  Dry friction may have held any
-part of itself in the torque at rest: work stays above zero all the same.  Valid while gravity is as it
-was at rest: for small motions.
+What may be missing: positions are whole counts, which by summation by parts is half a count times what
+the torque goes up and down.  Where the encoder counts, torque may answer to that very rounding, and
+all of it is allowed; else it is noise, which adds up as squares do.  Besides, the torque at rest, which
+is known from a trial before, may be off by some of its own steps and UNSURE of the torque limit.  Dry
+friction may have held any part of itself in the torque at rest: work stays above zero all the same.
+Valid while gravity is as it was at rest: for small motions.
 """
 
 from collections.abc import Sequence
@@ -22,8 +23,44 @@ import numpy as np
 from fieldtool.experiment.verification.oscillation import TORQUE_UNITS
 from fieldtool.records.model import FloatArray
 
-UNSURE = 0.005
-"""Share of the torque limit by which a torque at rest may have changed."""
+UNSURE, STEPS = 0.0002, 0.5
+"""Share of the torque limit, and steps in which it is told, by which a torque at rest may be off."""
+SIGMAS = 4.0
+TINY = 1e-300
+LEARNED = 2.0
+"""Times the work that was missing with the old parameters, over what is usually allowed, that may be
+missing with the new ones: something shakes the machine, or motors lag what their drives tell."""
+
+
+class WorkRecord:
+    """Keeps what axes did in small motions, for the torque at rest is known only afterwards."""
+
+    def __init__(self) -> None:
+        self._parts: list[list[tuple[Sequence[float], Sequence[float]]]] = []
+
+    def begin(self) -> None:
+        """All axes stand; what they did before is a part of its own."""
+        self._parts.append([])
+
+    def take(
+        self, position: Sequence[float], torque: Sequence[float], *, fresh: bool
+    ) -> list[tuple[int, str]]:
+        """Take one SYNC of all axes; nothing is said of it."""
+        if not fresh or not self._parts:
+            self.begin()
+        if fresh:
+            self._parts[-1].append((position, torque))
+        return []
+
+    def most(self, watch: "WorkWatch") -> float:
+        """Return the largest share of what a watch allows that was missing."""
+        worst = 0.0
+        for part in self._parts:
+            watch.begin()
+            for position, torque in part:
+                watch.take(position, torque, fresh=True)
+                worst = max(worst, watch.missing)
+        return worst
 
 
 class WorkWatch:
@@ -35,10 +72,12 @@ class WorkWatch:
         Torques at rest where the axes stand, shape (M,), N m or N.
     counts
         One count of each encoder, shape (M,), rad or m.
-    limits
-        Of the torques, shape (M,), N m or N.
+    limits, quanta
+        Of the torques; steps in which they are told; shape (M,), N m or N.
     units
         Of positions, one an axis, for messages.
+    missing
+        Largest share of what is usually allowed that was missing with the old parameters.
     """
 
     def __init__(
@@ -46,18 +85,23 @@ class WorkWatch:
         rest: FloatArray,
         counts: FloatArray,
         limits: FloatArray,
+        quanta: FloatArray,
         units: Sequence[str] = (),
+        missing: float = 0.0,
     ) -> None:
+        self._scale = max(1.0, LEARNED * missing)
         self._rest, self._counts = rest, counts
         self._units = [(one, TORQUE_UNITS.get(one, "")) for one in units or [""] * rest.size]
-        self._unsure = UNSURE * limits
+        self._unsure = UNSURE * limits + STEPS * quanta
         self.begin()
 
     def begin(self) -> None:
         """All axes stand; what they did before is forgotten."""
         m = self._rest.size
+        self.missing = 0.0
+        """Work that is missing, over what may be by rounding and by the torque at rest."""
         self._start: FloatArray | None = None
-        self._work, self._rounding = np.zeros(m), np.zeros(m)
+        self._work, self._rounding, self._noise = np.zeros(m), np.zeros(m), np.zeros(m)
 
     def take(
         self, position: Sequence[float], torque: Sequence[float], *, fresh: bool
@@ -73,13 +117,16 @@ class WorkWatch:
             return []
         mean = (beside + self._torque) / 2
         self._work += mean * (at - self._at)
-        self._rounding += self._counts / 2 * np.abs(mean - self._mean)
+        rounding = self._counts / 2 * np.abs(mean - self._mean)
+        self._rounding += np.where(at == self._at, 0.0, rounding)
+        self._noise += rounding**2
         self._at, self._torque, self._mean = at, beside, mean
-        work, allowed = self._work, self._rounding
         way = np.maximum(np.abs(at - self._start), self._counts)
-        if work.sum() >= -(allowed + self._unsure * way).sum():
+        allowed = self._rounding + SIGMAS * np.sqrt(self._noise) + self._unsure * way
+        self.missing = -float(self._work.sum() / max(allowed.sum(), TINY))
+        if self.missing <= self._scale:
             return []
-        k = int(np.argmin(work))
+        k = int(np.argmin(self._work))
         unit, torque_unit = self._units[k]
         text = (
             f"moved by {float(at[k] - self._start[k]):.3g} {unit} against its own torque of "
