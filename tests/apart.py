@@ -300,8 +300,8 @@ class MachineApart:
         (session / "tuning.yaml").write_text(yaml.safe_dump(tuning))
         return session
 
-    def start(self, *arguments: object) -> "ToolProcess":
-        """Start the tool in a process of its own."""
+    def start(self, *arguments: object, tool: str | None = None) -> "ToolProcess":
+        """Start the tool in a process of its own; or a program that is told instead of it."""
         output = self.folder / "output.txt"
         words = [str(argument) for argument in arguments]
         if self._quick:
@@ -314,7 +314,7 @@ class MachineApart:
 
         with output.open("wb") as file:
             popen = subprocess.Popen(
-                [sys.executable, "-c", _TOOL, *words],
+                [sys.executable, "-c", tool or _TOOL, *words],
                 cwd=Path(__file__).parents[1],
                 stdin=subprocess.DEVNULL,
                 stdout=file,

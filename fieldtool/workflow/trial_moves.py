@@ -7,7 +7,7 @@ import numpy as np
 
 from drives.canopen_drive import CanopenDrive
 from fieldtool.design.moves import TestMove
-from fieldtool.design.predict import Prediction
+from fieldtool.design.predict import AxisPrediction, Prediction
 from fieldtool.errors import PlanRefusedError
 from fieldtool.experiment.forecast import Setting
 from fieldtool.experiment.verification.swings import Swings
@@ -26,6 +26,8 @@ MOST of the limit, and OTHERS of it on axes that are not moved."""
 MOST, OTHERS = 0.97, 0.95
 REST, LEAST_REST, MOST_REST = 2.0, 0.5, 6.0
 """Times the predicted settling for which a move is watched after its end; at least, at most, s."""
+SHAKES = 1.5
+"""Times the largest quick swing of its torque that is predicted that an axis may swing in its move."""
 UNFORESEEN, OFF_TARGET = 2.0, 0.05
 """Times what is predicted that an axis may swing and be off its target once its reference stands; and
 the share of the way by which it may be off besides."""
@@ -122,8 +124,26 @@ def trial_move(
     rise, held, _ = move.parts
     half = ACCELERATES * (2 * rise + held)
     swings, astray = _coming_to_rest(move, k, limits[k], predictions)
+    shakes = SHAKES * max((_quick_swing(one, half, limits[k]) for one in known), default=0.0)
     reference = move.reference(cycle)
-    return TrialMove(k, reference, round(rest / cycle), torque, half, swings, astray, answer)
+    return TrialMove(
+        k, reference, round(rest / cycle), torque, half, swings, astray, answer, shakes
+    )
+
+
+def _quick_swing(prediction: AxisPrediction, longest: float, limit: float) -> float:
+    """Return the largest swing of an axis' torque in its own move that turns within so many seconds."""
+    curves = prediction.curves
+    if curves is None:
+        return 0.0
+    swings, time = Swings(), curves.time
+    swings.restart(FINE_SWING * limit)
+    most = 0.0
+    for value in curves.torque.tolist():
+        if swings.take(value) and len(swings.times) > 1:
+            first, last = (time[n - 1] for n in swings.times[-2:])
+            most = max(most, swings.sizes[-1] if last - first <= longest else 0.0)
+    return most
 
 
 def _coming_to_rest(

@@ -5,7 +5,7 @@ import signal
 import numpy as np
 import pytest
 
-from tests.apart import MachineApart
+from tests.apart import MachineApart, is_download, object_of
 from tests.kills import random_moment, tried
 
 pytestmark = pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="no SIGKILL on Windows")
@@ -83,3 +83,46 @@ def test_a_killed_measurement_leaves_a_note_and_is_taken_back(machine):
     for node in machine.nodes:
         for key in ((0x2010, 4), (0x6007, 0), (0x1016, 1), (0x1029, 1), (0x60C2, 1)):
             assert after[node.node_id][key] == before[node.node_id][key], key
+
+
+ONLY_NEW = (
+    "from fieldtool.workflow.verifying import Verification as v; v.before = lambda _: None;"
+    "from fieldtool.cli.main import main; main()"
+)
+"""The tool without its trial of the old parameters, which takes its time."""
+PDOS = range(0x1400, 0x1C00)
+"""What PDOs hold and when they are sent: in working memory alone, and set anew before every motion."""
+OLD = {"position_p": 12.0, "velocity_p": 3.0, "velocity_i": 20.0}
+NEW = {"position_p": 15.0, "velocity_p": 3.5, "velocity_i": 25.0}
+
+
+def test_a_tool_that_is_killed_in_the_trial_leaves_drives_that_stop_and_can_be_restored(machine):
+    machine.set_up(OLD, store=True)
+    before = machine.working()
+    seen = {"written": 0, "syncs": 0}
+
+    def kill_in_trial(message):
+        if is_download(message) and object_of(message) == 0x2010:
+            seen["written"] += 1
+        if message.arbitration_id == 0x80 and seen["written"] and not tool.killed:
+            seen["syncs"] += 1
+            if any(node.motion.powered for node in machine.nodes) and seen["syncs"] > 300:
+                tool.kill()
+
+    machine.bus.on_frame = kill_in_trial
+    session = machine.session("tried", NEW)
+    tool = machine.start("write", session, "--yes", tool=ONLY_NEW)
+    ended = tool.wait()
+    assert ended.code == -9, ended.text
+    machine.bus.on_frame = lambda _: None
+    assert machine.working()[11][0x2010, 1] == 15000, "the new ones were on trial"
+    machine.ask(lambda: machine.machine.advance_to(machine.machine.time + 1_000_000_000))
+    for node in machine.nodes:
+        assert not node.motion.powered, "stopped by its own heartbeat consumer"
+    restored = machine.run("restore", session)
+    assert restored.code == 0, restored.text
+    after = machine.working()
+    for node in machine.nodes:
+        now, then = after[node.node_id], before[node.node_id]
+        assert {k for k in now if now[k] != then[k]} <= {k for k in now if k[0] in PDOS}
+    assert machine.stored() == before

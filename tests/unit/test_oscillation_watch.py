@@ -289,3 +289,19 @@ def test_a_torque_that_hisses_is_no_swing_and_one_that_swings_is_no_hiss():
         found = first_alarm(good(), np.zeros(3000), swing)
         assert found is not None
         assert found * STEP < 0.1 + 3 / frequency
+
+
+def test_what_a_move_is_foreseen_to_shake_is_no_swing_and_more_is_one():
+    time = np.arange(600) * STEP
+    push = 4.0 * np.sin(2 * np.pi * time / 0.6)
+    ring = np.where(time < 0.3, 0.5, 1.6) * np.sin(2 * np.pi * 25.0 * time)
+    ways = (np.array([-2.0]), np.array([2.0]), np.array([9.0]), 0.1)
+
+    def found(size, shakes):
+        one = watch()
+        one.move(*ways, axis=0, shakes=shakes)
+        return first_alarm(one, 0.3 * time, push + size * ring)
+
+    assert found(1.0, 0.0) is not None, "it would be taken for a swing that grows"
+    assert found(1.0, 1.5 * 3.2) is None
+    assert found(2.0, 1.5 * 3.2) is not None

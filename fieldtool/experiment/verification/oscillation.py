@@ -47,7 +47,8 @@ FAR_ABOVE = 5.0
 LASTS, DIES = 7, 0.9
 """At rest a swing has to be smaller than DIES times the one three periods before it."""
 MOST_STEPS = 0.6
-"""Share of the torque limit by which steps of the targets may make a torque swing, at most."""
+"""Share of the torque limit by which steps of the targets, or a move as it is foreseen, may make a torque
+swing, at most."""
 LONGEST_HALF = 0.25
 """Seconds from one turn to the next, at most."""
 SAGS = 2.0
@@ -201,16 +202,21 @@ class OscillationWatch:
         *,
         axis: int | None = None,
         gentle: bool = False,
+        shakes: float = 0.0,
     ) -> None:
         """Allow motion inside corridors (M,), with torques up to (M,) about those at rest.
 
         ``axis`` is the one that moves; on the others a torque that swings far above the level counts
         however slowly it turns.  A gentle one makes no swings of its own worth the name: they count as
-        at rest.
+        at rest.  ``shakes`` is how far the torque of the axis swings quickly, peak to peak, by what is
+        foreseen of its move: less is no swing.
         """
         share = HOLD_LEVEL if gentle else MOVE_LEVEL
         level = np.maximum(self._louder * HOLD_LEVEL, share) * self._torque_limits
         level = np.maximum(level, np.minimum(self._steps, MOST_STEPS * self._torque_limits))
+        if axis is not None:
+            most = MOST_STEPS * float(self._torque_limits[axis])
+            level[axis] = max(float(level[axis]), min(shakes, most))
         self._allow(
             Allowed(
                 low,

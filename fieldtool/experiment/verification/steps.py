@@ -55,6 +55,9 @@ class TrialMove:
     """Some counts to and fro in some cycles, from 0 to 0, shape (n,), that the controller is known by;
     empty: none."""
 
+    shakes: float = 0.0
+    """Peak to peak of its torque in quick swings while its reference moves, at most; 0: not known."""
+
     @property
     def distance(self) -> float:
         """With its sign."""
@@ -138,7 +141,9 @@ class Steps:
     def _allow(self, move: TrialMove, *, back: bool = False) -> None:
         """Allow an axis its way out, or the way back."""
         low, high = self._ways(move.axis, move.distance, self._beyond(move), back=back)
-        self._watch.swings.move(low, high, move.torque, move.half_period, axis=move.axis)
+        self._watch.swings.move(
+            low, high, move.torque, move.half_period, axis=move.axis, shakes=move.shakes
+        )
 
     @staticmethod
     def _beyond(move: TrialMove) -> float:
