@@ -246,7 +246,7 @@ def test_nobody_is_asked_to_move_means_nothing_moves(session):
 
 
 def test_a_stop_by_the_user_during_the_trial_restores_everything(session, monkeypatch):
-    from fieldtool.cli import main as cli
+    from fieldtool.cli.stop_key import StopKey
     from fieldtool.workflow.verifying import Verification
 
     begun = []
@@ -263,7 +263,7 @@ def test_a_stop_by_the_user_during_the_trial_restores_everything(session, monkey
         asked.append(bool(begun))
         return sum(asked) > 1500
 
-    monkeypatch.setattr(cli.StopKey, "__call__", pressed)
+    monkeypatch.setattr(StopKey, "__call__", pressed)
     outcome = write(session)
     assert outcome.code == 130, outcome.err
     assert session.changed() == {}

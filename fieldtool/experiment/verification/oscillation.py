@@ -47,8 +47,8 @@ FAR_ABOVE = 5.0
 LASTS, DIES = 7, 0.9
 """At rest a swing has to be smaller than DIES times the one three periods before it."""
 MOST_STEPS = 0.6
-"""Share of the torque limit by which steps of the targets, or a move as it is foreseen, may make a torque
-swing, at most."""
+"""Share of the torque limit by which steps of the targets, or a move as it is foreseen, may make a
+torque swing, at most."""
 LONGEST_HALF = 0.25
 """Seconds from one turn to the next, at most."""
 SAGS = 2.0
