@@ -37,7 +37,7 @@ from fieldtool.identify.likelihood.refine import machine_response, refine
 from fieldtool.identify.likelihood.response_data import matrix_of
 from fieldtool.identify.modes.fit import fit_modes
 from fieldtool.identify.modes.search import find_modes
-from fieldtool.identify.multisine.identify import WEIGHTINGS
+from fieldtool.identify.multisine.fit import WEIGHTINGS
 from fieldtool.identify.multisine.whole_records import WholeRecords
 from fieldtool.records.model import Estimate
 from fieldtool.records.recording import AxisInfo, Experiment, Recording

@@ -14,7 +14,8 @@ from fieldtool.identify.likelihood.parameters import (
     parameter_values,
     with_values,
 )
-from fieldtool.identify.likelihood.record_data import RecordData, Spectrum, spectrum_of
+from fieldtool.identify.likelihood.record_data import RecordData
+from fieldtool.identify.likelihood.record_spectrum import Spectrum, spectrum_of
 from fieldtool.identify.likelihood.refine import RefinedModel, machine_response, refine
 from fieldtool.identify.modes.scan import noise_limit
 from fieldtool.identify.multisine.dry_friction import VELOCITY_BAND, signs_of_velocity

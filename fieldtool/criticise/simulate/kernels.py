@@ -18,6 +18,14 @@ CUBIC, GAP, STEP, DRY, SOFT = 1, 2, 3, 4, 5
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
+def plus_row(total: float, matrix: FloatArray, row: int, vector: FloatArray) -> float:
+    """Return total plus one row of a matrix times a vector, added up in order."""
+    for j in range(vector.size):
+        total += matrix[row, j] * vector[j]
+    return total
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
 def march(
     step: FloatArray,
     early: FloatArray,
@@ -41,20 +49,15 @@ def march(
             total = 0.0
             for j in range(many):
                 total += of_input[i, j] * inputs[k, j]
-            for j in range(size):
-                total += of_state[i, j] * z[j]
-            out[k, i] = total
+            out[k, i] = plus_row(total, of_state, i, z)
         if k + 1 == n:
             break
         for i in range(size):
             total = 0.0
             for j in range(many):
                 total += early[i, j] * driven[k, j] + late[i, j] * driven[k + 1, j]
-            for j in range(size):
-                total += step[i, j] * z[j]
-            following[i] = total
-        for i in range(size):
-            z[i] = following[i]
+            following[i] = plus_row(total, step, i, z)
+        z[:] = following
     return out
 
 
@@ -68,17 +71,10 @@ def ring(step: FloatArray, of_state: FloatArray, starts: FloatArray, rows: int) 
         z[:] = starts[first]
         for k in range(rows):
             for i in range(M):
-                total = 0.0
-                for j in range(size):
-                    total += of_state[i, j] * z[j]
-                out[first, k, i] = total
+                out[first, k, i] = plus_row(0.0, of_state, i, z)
             for i in range(size):
-                total = 0.0
-                for j in range(size):
-                    total += step[i, j] * z[j]
-                following[i] = total
-            for i in range(size):
-                z[i] = following[i]
+                following[i] = plus_row(0.0, step, i, z)
+            z[:] = following
     return out
 
 
@@ -146,6 +142,35 @@ def pull(
 
 
 @njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def stretch(
+    ends: IntArray,
+    place: IntArray,
+    z: FloatArray,
+    hidden: int,
+    moved: FloatArray,
+    rise: FloatArray,
+    parts: float,
+) -> tuple[float, float]:
+    """Return by how much an element is longer than at rest, and how fast that grows.
+
+    Its two ends are masses, -1 the ground; ``place`` as in :func:`march_bent`.  The motors are where
+    they were at the sample, ``moved`` (3 M,), and ``parts`` times ``rise`` further.
+    """
+    s, rate, M = 0.0, 0.0, rise.size // 3
+    for end in range(2):
+        if ends[end] >= 0:
+            sign = -1.0 if end == 0 else 1.0
+            j = place[ends[end]]
+            if j >= M:
+                s += sign * z[j - M]
+                rate += sign * z[hidden + j - M]
+            else:
+                s += sign * (moved[j] + parts * rise[j])
+                rate += sign * (moved[M + j] + parts * rise[M + j])
+    return s, rate
+
+
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def march_bent(
     step: FloatArray,
     of_start: FloatArray,
@@ -204,43 +229,19 @@ def march_bent(
                 rising[i] += both * rise[j]
         for part in range(substeps):
             for e in range(E):
-                s, rate = 0.0, 0.0
-                for end in range(2):
-                    dof = ends[e, end]
-                    if dof >= 0:
-                        sign = -1.0 if end == 0 else 1.0
-                        if place[dof] >= M:
-                            s += sign * z[place[dof] - M]
-                            rate += sign * z[H + place[dof] - M]
-                        else:
-                            j = place[dof]
-                            s += sign * (inputs[k, j] + part * rise[j])
-                            rate += sign * (inputs[k, M + j] + part * rise[M + j])
+                s, rate = stretch(ends[e], place, z, H, inputs[k], rise, part)
                 now[e] = pull(laws[e], values[e], s, rate, clock[k], period, part / substeps)
                 if part == 0:
                     pushed[k, ends[e, 0]] += now[e]
                     if ends[e, 1] >= 0:
                         pushed[k, ends[e, 1]] -= now[e]
             for i in range(size):
-                total = middle[i] + part * rising[i]
-                for j in range(size):
-                    total += step[i, j] * z[j]
+                total = plus_row(middle[i] + part * rising[i], step, i, z)
                 for e in range(E):
                     total += (early[e, i] + late[e, i]) * now[e]
                 ahead[i] = total
             for e in range(E):
-                s, rate = 0.0, 0.0
-                for end in range(2):
-                    dof = ends[e, end]
-                    if dof >= 0:
-                        sign = -1.0 if end == 0 else 1.0
-                        if place[dof] >= M:
-                            s += sign * ahead[place[dof] - M]
-                            rate += sign * ahead[H + place[dof] - M]
-                        else:
-                            j = place[dof]
-                            s += sign * (inputs[k, j] + (part + 1) * rise[j])
-                            rate += sign * (inputs[k, M + j] + (part + 1) * rise[M + j])
+                s, rate = stretch(ends[e], place, ahead, H, inputs[k], rise, part + 1)
                 later = (part + 1) / substeps
                 then[e] = pull(laws[e], values[e], s, rate, clock[k], period, later)
             for i in range(size):

@@ -17,7 +17,7 @@ from fieldtool.identify.multisine.dry_friction import (
     dry_friction,
     without_dry_friction,
 )
-from fieldtool.identify.multisine.identify import lines_of, phasors_of
+from fieldtool.identify.multisine.lines import lines_of, phasors_of
 from fieldtool.identify.multisine.records import settled, with_periods
 from fieldtool.identify.multisine.whole_records import WholeRecords
 from fieldtool.records.model import Estimate, FloatArray, MachineModel

@@ -20,14 +20,9 @@ from fieldtool.frf.held_targets import Fold, folds
 from fieldtool.frf.multisine.lines import LinePhasors, same_level
 from fieldtool.frf.multisine.transient import windows
 from fieldtool.frf.phasors import equation_errors
-from fieldtool.identify.likelihood.record_data import (
-    RecordData,
-    RecordSystem,
-    Spectrum,
-    TorquePart,
-    amplitudes,
-    spectrum_of,
-)
+from fieldtool.identify.likelihood.record_data import RecordData, TorquePart
+from fieldtool.identify.likelihood.record_spectrum import Spectrum, amplitudes, spectrum_of
+from fieldtool.identify.likelihood.record_system import RecordSystem
 from fieldtool.identify.likelihood.refine import RefinedModel, machine_response
 from fieldtool.identify.likelihood.whitening import whitening
 from fieldtool.identify.multisine.dry_friction import SEEN, DryFriction, signs_of_velocity
