@@ -26,6 +26,7 @@ from fieldtool.design.tuning import (
     BOUND,
     MOST_BOUND,
     RESPONSES,
+    SOFTEST,
     AxisTuning,
     TradePoint,
     Tuning,
@@ -37,8 +38,6 @@ TRADE = (0.25, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0)
 SEED = 20
 NARROWER = 0.99
 """Times the bandwidth of a softer response that one has at least."""
-SOFTEST = min(RESPONSES, key=RESPONSES.__getitem__)
-"""The response that is chosen because the machine is too lively as it is."""
 KEPT = "nothing better than the present parameters was found: they are kept."
 SWINGS = 0.25
 """Damping ratio below which a vibration is left to shape."""

@@ -15,6 +15,8 @@ from fieldtool.records.closed_loop import Biquad
 
 RESPONSES: Mapping[str, float] = {"soft": 0.4, "normal": 0.7, "stiff": 1.0}
 """A technician's choices: how much of the room between 1 and the bound the peak of sensitivity uses."""
+SOFTEST = min(RESPONSES, key=RESPONSES.__getitem__)
+"""The response that is asked for because the machine is too lively as it is."""
 BOUND = 2.0
 """Peak of sensitivity that no axis may exceed: 6 dB."""
 MOST_BOUND = 3.0

@@ -22,7 +22,7 @@ from drives.errors import (
 )
 from drives.parameters import Change
 from fieldtool.design.servo import Servo
-from fieldtool.design.tuning import Tuning, why_not_stored
+from fieldtool.design.tuning import SOFTEST, Tuning, why_not_stored
 from fieldtool.design.verdict import Comparison, faults
 from fieldtool.errors import IdentificationError, OutputError
 from fieldtool.experiment.axes import Axes
@@ -303,11 +303,13 @@ class Verification:
             self._recorder = None
 
     def _judge(self, tried: Tried) -> tuple[str, ...]:
-        plan = self._planned
+        plan, soft = self._planned, self._tuning.response == SOFTEST
         return tuple(
             text
             for one in self._records.compared(self._old, tried)
-            for text in faults(one, plan.trial.cycle_time, self._bound, believed=self._believed)
+            for text in faults(
+                one, plan.trial.cycle_time, self._bound, believed=self._believed, softer=soft
+            )
         )
 
     def _conclude(self, tried: Tried | None, reasons: tuple[str, ...]) -> None:

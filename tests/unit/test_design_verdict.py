@@ -18,6 +18,18 @@ def told(before=GOOD, predicted=GOOD, after=GOOD, *, measured=CURVE, believed=Tr
     return faults(one, 0.001, 2.0, believed=believed)
 
 
+def test_a_softer_machine_may_settle_later_where_the_old_parameters_are_beyond_the_bound():
+    slow = replace(GOOD, settling_time=0.3)
+    lively = replace(GOOD, sensitivity_peak=2.6)
+    one = Comparison("x", "rad", 1.0, 0.5, 0.01, lively, slow, slow, None, CURVE, CURVE)
+    assert faults(one, 0.001, 2.0, believed=True, softer=True) == ()
+    assert "5 % more" in faults(one, 0.001, 2.0, believed=True)[0]
+    within = replace(one, before=GOOD)
+    assert "5 % more" in faults(within, 0.001, 2.0, believed=True, softer=True)[0]
+    later = replace(one, after=replace(slow, settling_time=0.6))
+    assert "was predicted" in faults(later, 0.001, 2.0, believed=True, softer=True)[0]
+
+
 def curve(size):
     return Sensitivity(FREQUENCY, np.full(3, size))
 
