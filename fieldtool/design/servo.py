@@ -66,6 +66,10 @@ class Servo:
         followed = self._pi(s) * (loop.position_p + loop.velocity_ff * s)
         return self._torque(s) * (followed + loop.inertia_ff * s * s * self._held(s))
 
+    def offset_gain(self, s: ComplexArray) -> ComplexArray:
+        """Return torque per torque that is added before the filters, shape of ``s``, rad/s."""
+        return self._torque(s)
+
     def step_gain(self, s: ComplexArray) -> ComplexArray:
         """Return torque per reference without feed-forward, as a step of the reference needs it."""
         return self._torque(s) * self._pi(s) * self.loop.position_p

@@ -1,12 +1,13 @@
 """What the records of a trial come to: each axis before, as predicted, and after, on one scale."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from fieldtool.design.excited import Periodic, excited
 from fieldtool.design.loops import Loops
-from fieldtool.design.machine import machine_of, respond
+from fieldtool.design.machine import Machine, machine_of, respond
 from fieldtool.design.measured import (
     AxisFigures,
     Excited,
@@ -19,10 +20,14 @@ from fieldtool.design.predict import Prediction
 from fieldtool.design.servo import Servo
 from fieldtool.design.verdict import Comparison
 from fieldtool.experiment.axes import Axes
+from fieldtool.experiment.verification.excitation import Lines
 from fieldtool.experiment.verification.trial import Tried
 from fieldtool.records.model import FloatArray, MachineModel
 from fieldtool.report.verification_picture import History
 from fieldtool.workflow.trial_plan import TrialPlan
+
+HIDDEN = 0.9
+"""Share of the loop's own peak of sensitivity below which friction hides it from a small excitation."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,6 +42,20 @@ class TrialRecords:
     def compared(self, old: Tried | None, new: Tried | None) -> tuple[Comparison, ...]:
         """Return every axis with the old and with the new parameters; None: not tried."""
         return tuple(self._comparison(k, old, new) for k in range(len(self.plan.moves)))
+
+    def notes(self, compared: Sequence[Comparison]) -> tuple[str, ...]:
+        """Return what has to be known of a comparison besides its figures, a sentence each."""
+        found = []
+        for one, foreseen in zip(compared, self.plan.after.axes, strict=True):
+            shown = one.sensitivity_predicted
+            own = foreseen.margins.sensitivity_peak
+            if shown is not None and shown.peak < HIDDEN * own:
+                found.append(
+                    f"{one.axis}: dry friction holds it in the small excitation. Its peak of "
+                    f"sensitivity is compared with what that should show, {shown.peak:.3g}; the loop's "
+                    f"own is {own:.3g} by the model, and is seen in the move alone."
+                )
+        return tuple(found)
 
     def history(self, tried: Tried | None, k: int) -> History:
         """Return time, reference, position of an axis' own move, from where it began."""
@@ -55,7 +74,7 @@ class TrialRecords:
         for curve in (new_curve, old_curve):
             if curve is not None:
                 frequency = curve.frequency
-        expected = None if frequency is None else self._predicted(plan.new, k, frequency)
+        expected = None if frequency is None else self._predicted(k, frequency)
         return Comparison(
             move.axis,
             self.axes.unit(k),
@@ -94,10 +113,32 @@ class TrialRecords:
             servo,
         )
 
-    def _predicted(self, servos: Sequence[Servo], k: int, frequency: FloatArray) -> Sensitivity:
-        response = respond(machine_of(self.model), 2 * np.pi * frequency)
+    def _predicted(self, k: int, frequency: FloatArray) -> Sensitivity:
+        """Return what the new parameters should show: with dry friction, what is seen of them."""
+        machine, lines, servos = machine_of(self.model), self.plan.lines, self.plan.new
+        if machine.dry and lines is not None:
+            return self._rubbing(machine, lines, k)
+        response = respond(machine, 2 * np.pi * frequency)
         return Sensitivity(
-            frequency, np.abs(Loops(response, tuple(servos)).sensitivity[:, k]).astype(np.float64)
+            frequency, np.abs(Loops(response, servos).sensitivity[:, k]).astype(np.float64)
+        )
+
+    def _rubbing(self, machine: Machine, lines: Lines, k: int) -> Sensitivity:
+        excitation = self.plan.trial.excitation
+        if excitation is None:
+            raise AssertionError("lines are those of an excitation")
+        one, own = excitation.experiments[0], lines.axis == k
+        sent = Periodic(lines.number, lines.samples, one.cycle_time, one.reference, one.torque)
+        servos = self.plan.new
+        if not np.all(lines.by_torque):  # as the trial does it
+            servos = tuple(
+                replace(s, loop=replace(s.loop, velocity_ff=0.0, inertia_ff=0.0)) for s in servos
+            )
+        position, torque = excited(machine, servos, sent, k)
+        offset = sent.signals(one.torque[:, [k]])[:, 0] if np.all(lines.by_torque[own]) else None
+        return measured_sensitivity(
+            Excited(lines.number[own], lines.samples, one.cycle_time, position, torque, offset),
+            self.plan.new[k],
         )
 
 

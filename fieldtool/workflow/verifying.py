@@ -331,7 +331,7 @@ class Verification:
             self._bound,
             "identified" if self._believed else "prior",
             self._planned.trial.cycle_time,
-            self._planned.notes,
+            (*self._planned.notes, *self._records.notes(compared)),
             tuple(moves),
         )
         self._session.screen.verified(self.result)

@@ -82,6 +82,45 @@ def test_good_parameters_are_tried_kept_and_compared_on_one_scale(session):
     assert (session.out / "verification.png").stat().st_size > 10_000
 
 
+def test_dry_friction_in_the_model_is_reckoned_with_in_the_trial(make_bench, profile_of_two):
+    """It rules settling, and hides the loop from a small excitation: both are predicted."""
+    share = 0.05
+    for axis, simulated in zip(
+        profile_of_two["axes"], profile_of_two["simulation"]["axes"], strict=True
+    ):
+        torque = share * float(str(axis["limits"]["torque"]).split()[0])
+        simulated["effects"] = [
+            {"effect": "coulomb_friction", "location": "motor", "torque": torque}
+        ]
+    bench = begun(make_bench(profile_of_two))
+    path = bench.out / "model.yaml"
+    model = yaml.safe_load(path.read_text())
+    model["effects"] = [one for one in model["effects"] if one["effect"] != "coulomb_friction"] + [
+        {"effect": "coulomb_friction", "axis": axis["name"], "location": "motor",
+         "parameters": {"torque": simulated["effects"][0]["torque"]}}
+        for axis, simulated in zip(
+            profile_of_two["axes"], profile_of_two["simulation"]["axes"], strict=True
+        )
+    ]  # fmt: skip
+    path.write_text(yaml.safe_dump(model))
+    outcome = write(bench)
+    assert outcome.code == 0, outcome.err
+    found = verification(bench)
+    assert found["verdict"] == "verified"
+    for axis in found["axes"]:
+        predicted, after = axis["predicted"], axis["after"]
+        assert after["sensitivity_peak"] == pytest.approx(predicted["sensitivity_peak"], rel=0.2)
+        assert after["settling_time"] == pytest.approx(
+            predicted["settling_time"], rel=0.15, abs=3 * found["cycle"] + 0.01
+        )
+    # without it in the model, the same machine is not what was predicted
+    model["effects"] = [one for one in model["effects"] if one["effect"] != "coulomb_friction"]
+    path.write_text(yaml.safe_dump(model))
+    outcome = write(bench)
+    assert outcome.code == 6
+    assert "was predicted" in outcome.err or "off the predicted one" in outcome.err
+
+
 def test_only_what_was_tried_is_stored(session):
     outcome = write(session, "--store", "--no-verify")
     assert outcome.code == 2
