@@ -180,7 +180,6 @@ class MachineApart:
         self.looks: list[Callable[[], None]] = []
         """Called about once a millisecond by the thread that serves."""
         self._environment = {"FIELDTOOL_STATE_DIR": str(folder / "notes")}
-        os.environ |= self._environment
         if quick:
             self._context = multiprocessing.get_context("forkserver")
             self._context.set_forkserver_preload(["__main__", "fieldtool.cli.main"])
@@ -220,8 +219,6 @@ class MachineApart:
         self._ended.set()
         self._thread.join()
         self.bus.shutdown()
-        for name in self._environment:
-            os.environ.pop(name, None)
 
     def _serve(self) -> None:
         serve(self.machine, self.bus, self._ended.is_set)
@@ -304,9 +301,10 @@ class MachineApart:
         """Start the tool in a process of its own; or a program that is told instead of it."""
         output = self.folder / "output.txt"
         words = [str(argument) for argument in arguments]
+        environment = {**os.environ, **self._environment}
         if self._quick:
             process: Any = self._context.Process(
-                target=_run_tool, args=(words, str(output), dict(os.environ)), daemon=True
+                target=_run_tool, args=(words, str(output), environment), daemon=True
             )
             process.start()
             return ToolProcess(process.pid, process, output)
@@ -316,6 +314,7 @@ class MachineApart:
             popen = subprocess.Popen(
                 [sys.executable, "-c", tool or _TOOL, *words],
                 cwd=Path(__file__).parents[1],
+                env=environment,
                 stdin=subprocess.DEVNULL,
                 stdout=file,
                 stderr=subprocess.STDOUT,
