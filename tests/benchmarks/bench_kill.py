@@ -3,10 +3,10 @@
 The drives live in this process, served over a socket, some machines at a time, since most of the time
 is waiting for drives that store and for the bus to be quiet; ``fieldtool write`` and ``fieldtool
 restore`` are processes of their own, and the first is ended by SIGKILL: before its first write, after a
-frame while it writes or reads back, or while drives store.  In half of the trials the supply of one or all drives fails
-at that moment (a drive that is storing then holds old, new, or corrupted memory); in some the
-restore is killed as well, and repeated.  In the end working memory and non-volatile memory of all
-drives are compared with what they held before.
+frame while it writes or reads back, or while drives store.  In half of the trials the supply of one or
+all drives fails at that moment (a drive that is storing then holds old, new, or corrupted memory); in
+some the restore is killed as well, and repeated.  In the end working memory and non-volatile memory of
+all drives are compared with what they held before.
 
 Target: never a mixed machine, never a lost backup.
 
