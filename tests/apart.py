@@ -313,8 +313,8 @@ class MachineApart:
         with output.open("wb") as file:
             popen = subprocess.Popen(
                 [sys.executable, "-c", tool or _TOOL, *words],
-                cwd=Path(__file__).parents[1],
-                env=environment,
+                cwd=self.folder,
+                env=environment | {"PYTHONPATH": str(Path(__file__).parents[1])},
                 stdin=subprocess.DEVNULL,
                 stdout=file,
                 stderr=subprocess.STDOUT,

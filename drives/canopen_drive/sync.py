@@ -15,6 +15,8 @@ _BEFORE_NOW = 1e-7
 """Seconds by which a moment may be early: no clock is finer."""
 PULL, MOST_PULL = 0.3, 0.2
 """Share of the kernel's lateness that its next period makes up for, and largest change of a period."""
+OLDEST = 5.0
+"""Seconds that a frame may have waited to be read; more, or less than none: the clock was set."""
 GONE = 1.5
 """Cycles without the kernel's SYNC after which its lease has ended."""
 
@@ -97,7 +99,7 @@ class KernelSync(HostSync):
         super().__init__(line, cycle_time)
         self._lease = LeasedSync(str(getattr(line.can_bus, "channel", "")), SYNC_ID)
         self._origin: float | None = None
-        """Time stamp of the first SYNC of the present count; None before it."""
+        """Moment of the first SYNC of the present count, by the bus' clock; None before it."""
         self._period = cycle_time
 
     def restart(self) -> None:
@@ -112,7 +114,7 @@ class KernelSync(HostSync):
         One that came before they were all sent is no SYNC of this cycle: the cycle is late.
         """
         line = self._line
-        sent, overtaken = time.time(), 0.0
+        sent, overtaken = line.clock.now(), 0.0
         if self._origin is None:
             self._lease.start(self._period)
         else:
@@ -125,21 +127,28 @@ class KernelSync(HostSync):
                 self._lease.start(self._cycle_time)
             elif message.arbitration_id != SYNC_ID or message.is_extended_id:
                 early(message)
-            elif message.timestamp < sent:
-                overtaken = max(overtaken, sent - message.timestamp)
+            elif (moment := self._moment(message)) < sent:
+                overtaken = max(overtaken, sent - moment)
                 self._count += 1
             else:
                 break
-        self._follow(message.timestamp, overtaken)
-        return line.clock.now() - max(0.0, time.time() - message.timestamp)
+        self._follow(moment, overtaken)
+        return moment
 
-    def _follow(self, stamp: float, overtaken: float) -> None:
+    def _moment(self, message: can.Message) -> float:
+        """Return when a frame came, by the bus' clock, which nobody sets: the kernel stamps by its
+        time of day.
+        """
+        age = time.time() - message.timestamp
+        return self._line.clock.now() - (age if 0 <= age <= OLDEST else 0.0)
+
+    def _follow(self, moment: float, overtaken: float) -> None:
         """Take note of how late a SYNC was, and choose the next period."""
         if self._origin is None:
-            self._origin, self._count = stamp, 0
-        phase = stamp - self._origin - self._count * self._cycle_time
-        if abs(phase) > self._cycle_time / 2:  # the clock was set, or the kernel was held up
-            self._origin, self._count = stamp, 0
+            self._origin, self._count = moment, 0
+        phase = moment - self._origin - self._count * self._cycle_time
+        if abs(phase) > self._cycle_time / 2:  # the kernel was held up
+            self._origin, self._count = moment, 0
         self._count += 1
         most = MOST_PULL * self._cycle_time
         self._period = self._cycle_time - min(most, max(-most, PULL * phase))

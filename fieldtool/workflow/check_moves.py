@@ -1,6 +1,8 @@
 """Check a machine by tiny moves; whatever happens, all axes are off afterwards, and all is put back."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from datetime import datetime
 from pathlib import Path
 
 from drives.bus import Bus, clock_of
@@ -15,14 +17,18 @@ from fieldtool.experiment.checks.motion import judged_moves
 from fieldtool.experiment.directions import check_directions
 from fieldtool.experiment.forecast import Setting
 from fieldtool.records.recording import Experiment
+from fieldtool.records.session_folder import SessionFolder
+from fieldtool.records.yaml_file import write_yaml
 from fieldtool.workflow.fast_measuring import planned_before
 from fieldtool.workflow.models import prior_model
 from fieldtool.workflow.planning import timing, usual_seconds
 from fieldtool.workflow.preparation import axes_of, setting_of
+from fieldtool.workflow.session import resolved
+from fieldtool.writeback.temporary import backed_up
 from fieldtool.writeback.unfinished import refuse_unfinished
 
-SESSION = Path("sessions") / "check"
-"""Beside it a write that was cut off is looked for; nothing is put there."""
+SESSIONS = Path("sessions")
+"""Where a folder is made for as long as drives may hold other values; it stays if the tool is killed."""
 ROOM = "room for the sweeps"
 MOVE_CHECKS = (ROOM, "direction", "brake and friction", "load at rest")
 """Names of what is checked by moving."""
@@ -67,9 +73,13 @@ class MoveChecks:
         """
         try:
             with connect(self._machine, bus, stop_requested) as group:
-                refuse_unfinished(self._machine.name, group.drives, SESSION)
+                folder = (
+                    SESSIONS / f"check-{self._machine.path.stem}-{datetime.now():%Y%m%d-%H%M%S}"
+                )
+                refuse_unfinished(self._machine.name, group.drives, folder)
                 try:
-                    self._plan_and_move(group)
+                    with self._noted(group, folder):
+                        self._plan_and_move(group)
                 finally:
                     for text in group.warnings:
                         todo = "Switch the drive off and on."
@@ -82,6 +92,23 @@ class MoveChecks:
             self._ended(error, error.axis or "")
         except (DrivesError, FieldtoolError) as error:
             self._ended(error, "")
+
+    @contextmanager
+    def _noted(self, group: CanopenGroup, path: Path) -> Iterator[None]:
+        """Keep what ``fieldtool restore`` needs for as long as drives may hold other values."""
+        alone = not path.parent.exists()
+        folder = SessionFolder.create(path)
+        write_yaml(folder.machine, resolved(self._machine))
+        try:
+            with backed_up(self._machine.name, group.drives, folder.parameters_before):
+                yield
+        finally:
+            with suppress(OSError):  # what else is in it stays
+                folder.parameters_before.unlink(missing_ok=True)
+                folder.machine.unlink(missing_ok=True)
+                path.rmdir()
+                if alone:
+                    path.parent.rmdir()
 
     def _plan_and_move(self, group: CanopenGroup) -> None:
         kept: list[Experiment] = []

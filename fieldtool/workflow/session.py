@@ -227,7 +227,7 @@ def open_session(
                 f"{out}: already holds a session's recording, which is not overwritten. Choose another "
                 "folder with --out. Nothing was moved."
             )
-        write_yaml(folder.machine, _resolved(profile))
+        write_yaml(folder.machine, resolved(profile))
     session = Session(folder, profile, screen or Quiet())
     folder.note(
         "session",
@@ -270,7 +270,7 @@ def open_session(
     folder.note("ended")
 
 
-def _resolved(profile: MachineProfile) -> dict[str, Any]:
+def resolved(profile: MachineProfile) -> dict[str, Any]:
     """Return the profile as its file has it, with drive profiles found from the folder too.
 
     The bus is the one that is used, which may be another one than the file's.  Passwords stay out.

@@ -50,8 +50,9 @@ def test_the_check_would_see_a_mixed_machine(machine, fresh_rng: np.random.Gener
     assert machine.run("restore", session).code == 0
 
 
-def test_a_killed_measurement_leaves_a_note_and_is_taken_back(machine):
-    """Feed-forward is off while it runs: no later backup may take that for the machine's own."""
+@pytest.mark.parametrize("command", ["measure", "check"])
+def test_a_killed_measurement_leaves_a_note_and_is_taken_back(machine, command):
+    """Feed-forward is off while axes move: no later backup may take that for the machine's own."""
     machine.ask(lambda: [node.dictionary.write(0x2010, 4, 900) for node in machine.nodes])
     before = machine.working()
     syncs = []
@@ -64,16 +65,21 @@ def test_a_killed_measurement_leaves_a_note_and_is_taken_back(machine):
 
     machine.bus.on_frame = kill_in_motion
     session = machine.folder / "measured"
-    tool = machine.start("measure", machine.profile, "--yes", "--out", session)
+    out = ("--out", session) if command == "measure" else ()
+    tool = machine.start(command, machine.profile, "--yes", *out)
     assert tool.wait().code == -9
     machine.bus.on_frame = lambda _: None
+    if command == "check":
+        (session,) = (machine.folder / "sessions").iterdir()
     assert machine.working()[11][0x2010, 4] == 0
     assert (session / "parameters-before.yaml").is_file()
     machine.ask(lambda: machine.machine.advance_to(machine.machine.time + 1_000_000_000))
     for node in machine.nodes:
         assert not node.motion.powered, "stopped by its own heartbeat consumer"
         machine.ask(lambda node=node: node.motion.write_controlword(0x80))
-    looked = machine.run("measure", machine.profile, "--yes", "--out", machine.folder / "next")
+    looked = machine.run(
+        "measure", machine.profile, "--yes", "--out", machine.folder / f"next-{command}"
+    )
     assert looked.code == 3
     assert "a measurement was cut off" in looked.text
     restored = machine.run("restore", session)
