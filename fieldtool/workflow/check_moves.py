@@ -25,7 +25,7 @@ from fieldtool.workflow.planning import timing, usual_seconds
 from fieldtool.workflow.preparation import axes_of, setting_of
 from fieldtool.workflow.session import resolved
 from fieldtool.writeback.temporary import backed_up
-from fieldtool.writeback.unfinished import refuse_unfinished
+from fieldtool.writeback.unfinished import JOURNAL, refuse_unfinished
 
 SESSIONS = Path("sessions")
 """Where a folder is made for as long as drives may hold other values; it stays if the tool is killed."""
@@ -104,8 +104,9 @@ class MoveChecks:
                 yield
         finally:
             with suppress(OSError):  # what else is in it stays
-                folder.parameters_before.unlink(missing_ok=True)
-                folder.machine.unlink(missing_ok=True)
+                lock = (path / JOURNAL).with_suffix(".lock")
+                for left in (folder.parameters_before, folder.machine, lock):
+                    left.unlink(missing_ok=True)
                 path.rmdir()
                 if alone:
                     path.parent.rmdir()

@@ -13,6 +13,7 @@ from drives.sim.faults import (
     NodeVanishes,
     SdoRefused,
 )
+from fieldtool.workflow import check_moves
 
 NO_OBJECT = 0x06020000
 REVOLUTION = 2**20
@@ -128,6 +129,26 @@ def test_a_drive_that_would_not_stop_by_itself(
     found = findings(outcome)["table", "stops by itself"]
     assert (found["status"], word in found["found"]) == ("fail", True)
     assert small_bench.machine.sync_count == 0
+
+
+def test_what_is_kept_while_axes_move_is_gone_afterwards(
+    small_bench, monkeypatch, tmp_path
+) -> None:
+    """Backup and note are there in motion, for whoever has to put things right after a kill."""
+    folder = tmp_path / "here"
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    seen = []
+    check = check_moves.check_directions
+
+    def looked(*arguments: object) -> None:
+        seen.extend(path.name for path in folder.glob("sessions/*/*"))
+        check(*arguments)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(check_moves, "check_directions", looked)
+    assert small_bench.command("check", small_bench.profile, "--move").code == 0
+    assert {"machine.yaml", "parameters-before.yaml", "write-journal.yaml"} <= set(seen)
+    assert list(folder.iterdir()) == []
 
 
 def test_another_drive_than_the_profile_says(small_bench) -> None:
