@@ -223,6 +223,7 @@ class Verification:
             trusts_loops=trusts_loops,
             louder=self._louder(servos),
             steps=np.array([torque_steps(drive, servo, cycle) for drive, servo in pairs]),
+            sags=None if self._old is None else self._old.sags,
             guards=guards,
             report=self._session.screen.progress,
             exciting=partial(self._ready_to_excite, servos),

@@ -255,7 +255,7 @@ def roughen(data: dict[str, Any], rng: np.random.Generator) -> None:
             "torque_lag": {"time": float(rng.uniform(0.2e-3, 1e-3))},
             "measurement_delay": {"time": int(rng.integers(1, 9)) / 8000},
             "cogging": {"torque": limit * float(rng.uniform(0.002, 0.01)), "periods": 24},
-            "gravity": {"torque": limit * float(rng.uniform(0.01, 0.04)), "angle": 0.7},
+            "gravity": {"torque": limit * float(rng.uniform(0.002, 0.01)), "angle": 0.7},
         }
         truth["effects"] = [
             {"effect": name, **values} for name, values in own.items() if rng.random() < 0.4

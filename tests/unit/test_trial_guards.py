@@ -99,7 +99,7 @@ def trial_path(loop, count=COUNT, hold=100):
 def watch(loop, learned=None, noise=0.0, **changes):
     quanta = np.array([max(noise, 0.01)])
     if learned is None:
-        learned = Learned(np.array([2 * noise]), np.array([0.3]))
+        learned = Learned(np.array([2 * noise]), np.array([0.3]), np.zeros(1))
     return IdentityWatch([drive(loop, **changes)], STEP, quanta, learned, ["N m"])
 
 

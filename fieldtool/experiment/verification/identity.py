@@ -31,12 +31,14 @@ from fieldtool.records.model import FloatArray
 
 SETTLES = 0.05
 """Time constant, s: slower torques are not compared."""
+SETTLED = 2 * SETTLES
 SHARE = 0.2
 """Of the torque that is expected by which it may differ."""
 REMEMBERED = 0.015
 """s, time constant with which what was expected is forgotten."""
 SEEN, OF = 5, 8
 """Differences above what is allowed, of so many cycles, that are enough."""
+TINY = 1e-300
 GLARING, LATELY = 3.0, 0.05
 """Times what is allowed of which two differences are enough, within so many seconds."""
 BLIND, BLIND_AGAIN = 0.04, 0.1
@@ -44,7 +46,7 @@ BLIND, BLIND_AGAIN = 0.04, 0.1
 QUANTA, ENCODER, STILL = 3.0, 4.0, 3.0
 """Steps of the torque, times the RMS of what encoders' steps make, and times what was seen while all
 axes stood still, by which torques may differ at any time."""
-LEARNED, LEAST_LEARNED, MOST_LEARNED = 2.0, 0.5, 3.0
+LEARNED, LEAST_LEARNED, MOST_LEARNED = 2.5, 0.8, 4.0
 """Times the difference that was seen with the old parameters that is allowed with the new ones; of the
 usual one at least; and times the usual one above which a drive is not judged."""
 
@@ -57,6 +59,8 @@ class Learned:
     """Largest lasting difference while the axes stood still, N m or N."""
     share: FloatArray
     """Largest lasting difference of all, over what is usually allowed."""
+    late: FloatArray
+    """s, by which torques answered positions later or earlier than they should, by least squares."""
 
     def why_not(self) -> tuple[str, ...]:
         """Return for each axis why it can not be judged by what was seen; empty where it can."""
@@ -99,6 +103,7 @@ class IdentityWatch:
         self._units = tuple(units) or ("",) * m
         self._quanta = quanta
         self._still, self._share = np.zeros(m), np.zeros(m)
+        self._lateness = np.zeros((2, m))
         self._passed = SETTLES / (SETTLES + step)
         self._kept = exp(-step / REMEMBERED)
         self._standing = True
@@ -113,6 +118,8 @@ class IdentityWatch:
         """For each axis why nothing is said of it; empty where it is judged."""
         self._judged = [not why for why in self.why_not]
         late = np.array([loop.unsure for loop in loops])
+        if learned is not None:
+            late = late + LEARNED * learned.late
         self._late = np.array([late + [loop.unsure_targets for loop in loops], late])
         encoder = ENCODER * np.array([loop.noise for loop in loops])
         self._floor = QUANTA * self._quanta + encoder
@@ -138,17 +145,21 @@ class IdentityWatch:
         """Positions and torques one SYNC before the last, M values each; None where there are none yet.
 
         Of axes that are judged what is quick in the torque is what is expected, so only slow noise is
-        left in it.
+        left in it; but for the first SETTLED of a motion, when nobody knows yet what is slow.
         """
         if self._count == 0:
             return None
         position, torque = self._rows[-LATE][:2]
+        if self._count * self._step < SETTLED:
+            return position.tolist(), torque.tolist()
         expected = torque - self._quick[2] + self._quick[0] + self._quick[1]
         return position.tolist(), np.where(self._judged, expected, torque).tolist()
 
     def learned(self) -> Learned:
         """Return what was seen so far."""
-        return Learned(self._still.copy(), self._share.copy())
+        along, square = self._lateness
+        late = np.abs(along) / np.maximum(square, TINY)
+        return Learned(self._still.copy(), self._share.copy(), late)
 
     def take(
         self,
@@ -196,10 +207,13 @@ class IdentityWatch:
         now[:2] = self._expected.advance(targets.T, positions.T)
         now[2] = rows[-LATE][1]
         quick = self._passed * (self._quick + now - self._before)
+        turns = (quick[1] - self._quick[1]) / self._step
         slope = np.abs(quick[:2] - self._quick[:2]) / self._step
         self._before, self._quick = now, quick
         expected = quick[0] + quick[1]
         difference = np.abs(quick[2] - expected)
+        if self._learned is None and not self._standing:
+            self._lateness += (turns * (quick[2] - expected), turns**2)
         self._peak = np.maximum(np.abs(expected), self._kept * self._peak)
         self._slope = np.maximum(slope, self._kept * self._slope)
         allowed = self._floor + SHARE * self._peak + (self._late * self._slope).sum(axis=0)

@@ -51,7 +51,7 @@ MOST_STEPS = 0.6
 torque swing, at most."""
 LONGEST_HALF = 0.25
 """Seconds from one turn to the next, at most."""
-SAGS = 2.0
+SAGS = 4.0
 """Times the usual way that axes may sag, as they take over their weights, under loops that are known to
 be good."""
 HEARD = 0.1

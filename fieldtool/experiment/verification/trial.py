@@ -70,6 +70,8 @@ class Tried:
     """Peak-to-peak torque of each axis while all stood still, shape (M,)."""
     rest: FloatArray
     """Torque of each axis where it began, once all have come back there and rest, shape (M,)."""
+    sags: FloatArray
+    """How far each axis went as it was enabled, while it was told to stand, shape (M,)."""
 
     def move(self, axis: str) -> Experiment | None:
         """Return the move of an axis; None if there was none."""
@@ -90,6 +92,8 @@ def still_allowed(axes: Axes) -> FloatArray:
 
 
 NOBODY = Guards()
+SAGGED = 1.5
+"""Times the way that axes sagged before that they may sag again."""
 REST_TIME = 0.2
 """Seconds at the end of a move's record from which the torque at rest is taken."""
 
@@ -104,6 +108,7 @@ def run_trial(
     trusts_loops: bool,
     louder: FloatArray | None = None,
     steps: FloatArray | None = None,
+    sags: FloatArray | None = None,
     guards: Guards = NOBODY,
     report: Report = lambda _: None,
     exciting: Callable[[], AbstractContextManager[object]] = nullcontext,
@@ -124,6 +129,8 @@ def run_trial(
         Whose loops are tried, for the experiments' names: ``before``, ``after``.
     trusts_loops, louder, steps
         See :class:`OscillationWatch`.
+    sags
+        How far axes were seen to sag under other loops as they were enabled, shape (M,), rad or m.
     guards
         What else looks at every cycle.
     report
@@ -139,6 +146,8 @@ def run_trial(
         If a limit was passed, a drive failed or the user stopped.
     """
     still = still_allowed(axes)
+    if sags is not None:
+        still = np.maximum(still, SAGGED * sags)
     swings = OscillationWatch(
         axes.names,
         axes.limits,
@@ -183,7 +192,8 @@ def run_trial(
     noise = np.max([np.ptp(rest.torque[rest.rows // 2 :], axis=0) for rest in rests], axis=0)
     last = next((one.torque for one in reversed(kept) if one.kind == "moves"), rests[0].torque)
     rest = last[-round(REST_TIME / trial.cycle_time) :].mean(axis=0)
-    return Tried(tuple(kept), noise, rest)
+    sagged = np.abs(rests[0].position - rests[0].position_reference).max(axis=0)
+    return Tried(tuple(kept), noise, rest, sagged)
 
 
 def _named(plan: MultisinePlan, name: str) -> MultisinePlan:

@@ -49,7 +49,7 @@ class TrialWatch:
     def move(self, *, small: bool) -> None:
         """Say that targets move from now on; small motions leave gravity as it is."""
         if small and self._guards.work is not None:
-            self._guards.work.begin()
+            self._guards.work.begin(moves=True)
         self._small = small
         if self._guards.identity is not None:
             self._guards.identity.stand(still=False)

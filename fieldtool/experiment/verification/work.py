@@ -11,7 +11,8 @@ work of its axis negative from the first count on, and it grows with the square 
 What may be missing: positions are whole counts, which by summation by parts is half a count times what
 the torque goes up and down.  Where the encoder counts, torque may answer to that very rounding, and
 all of it is allowed; else it is noise, which adds up as squares do.  Besides, the torque at rest, which
-is known from a trial before, may be off by some of its own steps and UNSURE of the torque limit.  Dry
+is known from a trial before, may be off by some of its own steps and UNSURE of the torque limit; and
+while targets move, positions may be a cycle older than torques, or motors a cycle late.  Dry
 friction may have held any part of itself in the torque at rest: work stays above zero all the same.
 Valid while gravity is as it was at rest: for small motions.
 """
@@ -26,6 +27,8 @@ from fieldtool.records.model import FloatArray
 UNSURE, STEPS = 0.0002, 0.5
 """Share of the torque limit, and steps in which it is told, by which a torque at rest may be off."""
 SIGMAS = 4.0
+ANSWERS = 3
+"""Cycles in which a torque answers to a count."""
 TINY = 1e-300
 LEARNED = 2.0
 """Times the work that was missing with the old parameters, over what is usually allowed, that may be
@@ -36,11 +39,11 @@ class WorkRecord:
     """Keeps what axes did in small motions, for the torque at rest is known only afterwards."""
 
     def __init__(self) -> None:
-        self._parts: list[list[tuple[Sequence[float], Sequence[float]]]] = []
+        self._parts: list[tuple[bool, list[tuple[Sequence[float], Sequence[float]]]]] = []
 
-    def begin(self) -> None:
+    def begin(self, *, moves: bool = False) -> None:
         """All axes stand; what they did before is a part of its own."""
-        self._parts.append([])
+        self._parts.append((moves, []))
 
     def take(
         self, position: Sequence[float], torque: Sequence[float], *, fresh: bool
@@ -49,14 +52,14 @@ class WorkRecord:
         if not fresh or not self._parts:
             self.begin()
         if fresh:
-            self._parts[-1].append((position, torque))
+            self._parts[-1][1].append((position, torque))
         return []
 
     def most(self, watch: "WorkWatch") -> float:
         """Return the largest share of what a watch allows that was missing."""
         worst = 0.0
-        for part in self._parts:
-            watch.begin()
+        for moves, part in self._parts:
+            watch.begin(moves=moves)
             for position, torque in part:
                 watch.take(position, torque, fresh=True)
                 worst = max(worst, watch.missing)
@@ -95,34 +98,45 @@ class WorkWatch:
         self._unsure = UNSURE * limits + STEPS * quanta
         self.begin()
 
-    def begin(self) -> None:
-        """All axes stand; what they did before is forgotten."""
+    def begin(self, *, moves: bool = False) -> None:
+        """All axes stand; what they did before is forgotten.
+
+        ``moves`` says whether the targets move from now on.
+        """
+        self._moves = moves
         m = self._rest.size
         self.missing = 0.0
         """Work that is missing, over what may be by rounding and by the torque at rest."""
         self._start: FloatArray | None = None
-        self._work, self._rounding, self._noise = np.zeros(m), np.zeros(m), np.zeros(m)
+        self._work, self._allowed, self._noise = np.zeros(m), np.zeros(m), np.zeros(m)
+        self._counted = np.zeros(m)
 
     def take(
         self, position: Sequence[float], torque: Sequence[float], *, fresh: bool
     ) -> list[tuple[int, str]]:
         """Take one SYNC of all axes; return the one whose work is most negative, where there is such."""
         if not fresh:
-            self.begin()
+            self.begin(moves=self._moves)
             return []
         at, beside = np.array(position), np.array(torque) - self._rest
         if self._start is None:
             self._start = self._at = at
-            self._torque, self._mean = beside, beside
+            self._torque, self._mean, self._step = beside, beside, np.zeros_like(at)
             return []
         mean = (beside + self._torque) / 2
-        self._work += mean * (at - self._at)
+        step = at - self._at
+        self._work += mean * step
+        if self._moves:
+            self._allowed += np.abs(mean * (step - self._step))
+        self._step = step
         rounding = self._counts / 2 * np.abs(mean - self._mean)
-        self._rounding += np.where(at == self._at, 0.0, rounding)
+        counted = np.where(at != self._at, ANSWERS, np.maximum(self._counted - 1, 0))
+        self._counted = counted
+        self._allowed += np.where(counted > 0, rounding, 0.0)
         self._noise += rounding**2
         self._at, self._torque, self._mean = at, beside, mean
         way = np.maximum(np.abs(at - self._start), self._counts)
-        allowed = self._rounding + SIGMAS * np.sqrt(self._noise) + self._unsure * way
+        allowed = self._allowed + SIGMAS * np.sqrt(self._noise) + self._unsure * way
         self.missing = -float(self._work.sum() / max(allowed.sum(), TINY))
         if self.missing <= self._scale:
             return []
