@@ -95,3 +95,11 @@ def first_answer(
         times = 1.0
     answer: FloatArray = np.copysign(times, distance) * path
     return answer
+
+
+def answer_torque(loops: Sequence[DriveLoop], answer: FloatArray, cycle: float) -> float:
+    """Return how far a first answer makes the torque swing, peak to peak, while the axis stays."""
+    if not answer.size:
+        return 0.0
+    padded = np.concatenate([answer, np.zeros(answer.size // 2)])
+    return max(float(np.ptp(locked_torque(loop, padded, cycle))) for loop in loops)

@@ -89,7 +89,7 @@ def trial_move(
     limits: FloatArray,
     steps: float,
     predictions: Sequence[Prediction],
-    answer: FloatArray,
+    answer: tuple[FloatArray, float],
 ) -> TrialMove:
     """Return an axis' move with what it may do by any of these predictions.
 
@@ -106,7 +106,7 @@ def trial_move(
     predictions
         With the loops that it will meet.
     answer
-        See :func:`fieldtool.workflow.trial_loops.first_answer`.
+        Path and torque: see :func:`fieldtool.workflow.trial_loops.first_answer`.
     """
     known = [one.axes[k] for one in predictions if one.axes[k].move is not None]
     peak = max((one.peak_torque for one in known), default=0.0)
@@ -127,7 +127,7 @@ def trial_move(
     shakes = SHAKES * max((_quick_swing(one, half, limits[k]) for one in known), default=0.0)
     reference = move.reference(cycle)
     return TrialMove(
-        k, reference, round(rest / cycle), torque, half, swings, astray, answer, shakes
+        k, reference, round(rest / cycle), torque, half, swings, astray, *answer, shakes
     )
 
 

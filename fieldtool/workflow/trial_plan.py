@@ -21,8 +21,9 @@ from fieldtool.experiment.verification.excitation import (
 )
 from fieldtool.experiment.verification.trial import Trial
 from fieldtool.records.closed_loop import AxisLoop
+from fieldtool.records.model import FloatArray
 from fieldtool.workflow.design_inputs import moves_of, timing_of
-from fieldtool.workflow.trial_loops import drive_loop, first_answer
+from fieldtool.workflow.trial_loops import answer_torque, drive_loop, first_answer
 from fieldtool.workflow.trial_moves import MOST, free_move, takes_too_much, trial_move
 
 GENTLER, TIMES = 0.75, 12
@@ -181,16 +182,12 @@ def plan_trial(
         for k, drive in enumerate(group.drives)
     ]
     answers = [
-        first_answer(
-            [drive_loop(drive, servo) for servo in (old[k], new[k])],
-            abs(drive.scaling.position),
-            float(limits[k]),
-            moves[k].distance,
-            cycle,
-        )
+        _answer(drive, (old[k], new[k]), float(limits[k]), moves[k].distance, cycle)
         for k, drive in enumerate(group.drives)
     ]
-    unasked = [d.axis for d, answer in zip(group.drives, answers, strict=True) if not answer.size]
+    unasked = [
+        d.axis for d, answer in zip(group.drives, answers, strict=True) if not answer[0].size
+    ]
     notes = tuple(_UNASKED.format(axis) for axis in unasked)
     trial_moves = tuple(
         trial_move(move, k, cycle, limits, steps[k], (before, after), answers[k])
@@ -207,6 +204,15 @@ def plan_trial(
         notes,
     )
     return _with_excitation(plan, group, setting, steps)
+
+
+def _answer(
+    drive: CanopenDrive, servos: Sequence[Servo], limit: float, distance: float, cycle: float
+) -> tuple[FloatArray, float]:
+    """Return the path by which an axis' controller is known, and the torque that it takes."""
+    loops = [drive_loop(drive, servo) for servo in servos]
+    answer = first_answer(loops, abs(drive.scaling.position), limit, distance, cycle)
+    return answer, answer_torque(loops, answer, cycle)
 
 
 def _check_as_designed(

@@ -199,6 +199,11 @@ class Verification:
             raise OutputError(f"{path}: can not be removed ({error.strerror})") from error
 
     @property
+    def _speeds(self) -> FloatArray:
+        inertia = [sum(mass.value for mass in axis.masses) for axis in self._setting.model.axes]
+        return np.array(inertia) / self._planned.trial.cycle_time**2
+
+    @property
     def _records(self) -> TrialRecords:
         return TrialRecords(self._planned, self._axes, self._setting.model)
 
@@ -253,7 +258,7 @@ class Verification:
                     f"not be told from its torque: {why}. Swings, ways and torques are watched as ever."
                 )
         limits = np.array([one.torque for one in self._axes.limits])
-        known = self._old.rest, self._axes.counts, limits, quanta, self._axes.units
+        known = self._old.rest, self._axes.counts, limits, quanta, self._speeds, self._axes.units
         return Guards(identity, WorkWatch(*known, self._works.most(WorkWatch(*known))))
 
     @contextmanager

@@ -171,7 +171,7 @@ def test_a_disaster_behind_the_tools_back_is_caught_and_restored(session, monkey
     ("fault", "words"),
     [
         (Gains(ARM, 10.0), "where its parameters make"),
-        (Gains(TABLE, 0.1), "where its parameters make"),
+        (Gains(TABLE, 10.0), "its torque"),
         (Gains(TABLE, 10.0, (Parameter.INERTIA_FF,)), "its torque"),
         (MotorReversed(TABLE), "against its own torque"),
     ],

@@ -225,7 +225,7 @@ def test_references_and_positions_are_two_parts_of_one_torque():
 
 def work(position, torque, rest=0.0):
     one = WorkWatch(
-        np.array([rest]), np.array([COUNT]), np.array([LIMIT]), np.array([1e-3 * LIMIT]), ["rad"]
+        *(np.array([one]) for one in (rest, COUNT, LIMIT, 1e-3 * LIMIT, INERTIA / STEP**2)), ["rad"]
     )
     for n, (q, t) in enumerate(zip(position, torque, strict=True)):
         found = one.take([q], [t], fresh=True)

@@ -41,7 +41,7 @@ SEEN, OF = 5, 8
 TINY = 1e-300
 GLARING, LATELY = 3.0, 0.05
 """Times what is allowed of which two differences are enough, within so many seconds."""
-BLIND, BLIND_AGAIN = 0.04, 0.1
+BLIND, BLIND_AGAIN = 0.015, 0.1
 """s from the beginning of a motion, and from a sample that did not come, in which nothing is said."""
 QUANTA, ENCODER, STILL = 3.0, 4.0, 3.0
 """Steps of the torque, times the RMS of what encoders' steps make, and times what was seen while all

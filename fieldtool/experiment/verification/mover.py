@@ -13,6 +13,8 @@ from fieldtool.experiment.verification.watch import TrialWatch
 
 HOLD_TIME = 0.5
 """Seconds in which all axes stand still before anything else is asked of them."""
+ENABLED_TIME = 0.03
+"""Seconds in which torques may still answer to targets that followed positions until the enabling."""
 RISE_TIME = 0.5
 """Seconds in which axes go to where an excitation begins."""
 
@@ -46,8 +48,10 @@ class WatchedMover:
         self._watch.begin()
         with self._group.motion(cycle_time, free, torque_offset, self._watch) as motion:
             start = motion.position
-            self._watch.hold(start)
+            self._watch.hold(start, enabling=True)
             self.held = start
+            self.follow(motion, np.tile(start, (max(2, round(ENABLED_TIME / cycle_time)), 1)))
+            self._watch.hold(start)
             still = np.tile(start, (max(2, round(HOLD_TIME / cycle_time)), 1))
             self._rests.append(self.follow(motion, still))
             yield motion

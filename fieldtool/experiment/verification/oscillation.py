@@ -56,6 +56,8 @@ SAGS = 4.0
 be good."""
 HEARD = 0.1
 """s of the first standing still in which torques of loops that are known to be good are listened to."""
+ENABLING = 1.5
+"""Times what steps of targets usually make that they may make while drives are enabled."""
 HISS, LOUDEST = 9.0, 4.0
 """Times its deviation by which noise may swing a torque, peak to peak; and times the usual level
 that is allowed for it, at most."""
@@ -177,15 +179,22 @@ class OscillationWatch:
         level = self._louder * HOLD_LEVEL * self._torque_limits
         self._allow(replace(self._allowed, torque_swing=level))
 
-    def hold(self, at: FloatArray) -> None:
-        """Allow no more than standing still at positions, shape (M,)."""
+    def hold(self, at: FloatArray, *, enabling: bool = False) -> None:
+        """Allow no more than standing still at positions, shape (M,).
+
+        While drives are being enabled their targets follow their positions: by steps.
+        """
+        level = self._resting_louder * HOLD_LEVEL * self._torque_limits
+        if enabling:
+            steps = np.minimum(ENABLING * self._steps, MOST_STEPS * self._torque_limits)
+            level = np.maximum(level, steps)
         still = (SAGS if self._trusts_loops else 1.0) * self._still
         self._allow(
             Allowed(
                 at - still,
                 at + still,
                 self._torque_limits,
-                self._resting_louder * HOLD_LEVEL * self._torque_limits,
+                level,
                 self._position_swing / 2,
                 HOLD_TURNS,
                 growing=False,
@@ -302,7 +311,7 @@ class OscillationWatch:
     def take(self, position: Sequence[float], torque: Sequence[float]) -> Alarm | None:
         """Take one cycle; see ``drives.api.MotionWatch``."""
         if self._allowed is None:
-            self.hold(np.array(position))
+            self.hold(np.array(position), enabling=True)
         allowed = self._allowed
         if allowed is None:
             raise AssertionError("something is always allowed")

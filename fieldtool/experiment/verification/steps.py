@@ -26,6 +26,8 @@ SHAKEN = 4.0
 """Times what an axis may go at rest that it may be beside its way: the others' moves shake it."""
 PUSHED_ERROR = 0.3
 """Share of its following error limit by which an axis may be pushed that does not move itself."""
+SHAKES = 1.5
+"""Times the torque that a first answer should take, peak to peak, that is no swing yet."""
 PROBE_REST = 0.12
 """Seconds that are watched after a first answer."""
 NO_PROBE: FloatArray = np.zeros(0)
@@ -54,6 +56,8 @@ class TrialMove:
     probe: FloatArray = field(default_factory=lambda: NO_PROBE)
     """Some counts to and fro in some cycles, from 0 to 0, shape (n,), that the controller is known by;
     empty: none."""
+    answer: float = 0.0
+    """Peak to peak of the torque that it takes, N m or N."""
 
     shakes: float = 0.0
     """Peak to peak of its torque in quick swings while its reference moves, at most; 0: not known."""
@@ -86,9 +90,12 @@ class Steps:
             return
         k, step = move.axis, self._motion.cycle_time
         torque = np.minimum(self._gentle_torque, move.torque)
+        torque[k] = max(float(torque[k]), move.answer)
         low, high = self._ways(k, float(move.probe[np.argmax(np.abs(move.probe))]), 0.0)
         self._watch.move(small=True)
-        self._watch.swings.move(low, high, torque, PROBE_REST / 3, axis=k)
+        self._watch.swings.move(
+            low, high, torque, PROBE_REST / 3, axis=k, shakes=SHAKES * move.answer
+        )
         path = np.concatenate([move.probe, np.zeros(round(PROBE_REST / step))])
         self._stream(path, k, f"{self._name}: first answer of {self._axes.names[k]}", keep=False)
 

@@ -40,11 +40,12 @@ class TrialWatch:
         if self._guards.work is not None:
             self._guards.work.begin()
 
-    def hold(self, at: FloatArray) -> None:
+    def hold(self, at: FloatArray, *, enabling: bool = False) -> None:
         """Allow no more than standing still at positions, shape (M,)."""
-        self.swings.hold(at)
+        self.swings.hold(at, enabling=enabling)
         if self._guards.identity is not None:
-            self._guards.identity.stand(still=True)
+            self._guards.identity.begin()  # references are known from the enabling on
+            self._guards.identity.stand(still=not enabling)
 
     def move(self, *, small: bool) -> None:
         """Say that targets move from now on; small motions leave gravity as it is."""

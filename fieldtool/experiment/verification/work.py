@@ -12,7 +12,8 @@ What may be missing: positions are whole counts, which by summation by parts is 
 the torque goes up and down.  Where the encoder counts, torque may answer to that very rounding, and
 all of it is allowed; else it is noise, which adds up as squares do.  Besides, the torque at rest, which
 is known from a trial before, may be off by some of its own steps and UNSURE of the torque limit; and
-while targets move, positions may be a cycle older than torques, or motors a cycle late.  Dry
+while targets move, positions may be a cycle older than torques, or motors a cycle late.  What moves
+when it is first seen brings its motion along, twice what the model's masses make of it.  Dry
 friction may have held any part of itself in the torque at rest: work stays above zero all the same.
 Valid while gravity is as it was at rest: for small motions.
 """
@@ -27,6 +28,8 @@ from fieldtool.records.model import FloatArray
 UNSURE, STEPS = 0.0002, 0.5
 """Share of the torque limit, and steps in which it is told, by which a torque at rest may be off."""
 SIGMAS = 4.0
+FIRST = 4
+"""Cycles from which it is told how fast axes move already."""
 ANSWERS = 3
 """Cycles in which a torque answers to a count."""
 TINY = 1e-300
@@ -77,6 +80,8 @@ class WorkWatch:
         One count of each encoder, shape (M,), rad or m.
     limits, quanta
         Of the torques; steps in which they are told; shape (M,), N m or N.
+    speeds
+        Inertias over the cycle time squared, shape (M,): what makes energy of steps.
     units
         Of positions, one an axis, for messages.
     missing
@@ -89,12 +94,14 @@ class WorkWatch:
         counts: FloatArray,
         limits: FloatArray,
         quanta: FloatArray,
+        speeds: FloatArray,
         units: Sequence[str] = (),
         missing: float = 0.0,
     ) -> None:
         self._scale = max(1.0, LEARNED * missing)
         self._rest, self._counts = rest, counts
         self._units = [(one, TORQUE_UNITS.get(one, "")) for one in units or [""] * rest.size]
+        self._speeds = speeds
         self._unsure = UNSURE * limits + STEPS * quanta
         self.begin()
 
@@ -109,7 +116,7 @@ class WorkWatch:
         """Work that is missing, over what may be by rounding and by the torque at rest."""
         self._start: FloatArray | None = None
         self._work, self._allowed, self._noise = np.zeros(m), np.zeros(m), np.zeros(m)
-        self._counted = np.zeros(m)
+        self._counted, self._seen = np.zeros(m), 0
 
     def take(
         self, position: Sequence[float], torque: Sequence[float], *, fresh: bool
@@ -136,7 +143,12 @@ class WorkWatch:
         self._noise += rounding**2
         self._at, self._torque, self._mean = at, beside, mean
         way = np.maximum(np.abs(at - self._start), self._counts)
-        allowed = self._allowed + SIGMAS * np.sqrt(self._noise) + self._unsure * way
+        self._seen += 1
+        if self._seen <= FIRST:
+            step = (way + self._counts) / FIRST
+            self._brought = self._speeds * step**2
+            return []
+        allowed = self._brought + self._allowed + SIGMAS * np.sqrt(self._noise) + self._unsure * way
         self.missing = -float(self._work.sum() / max(allowed.sum(), TINY))
         if self.missing <= self._scale:
             return []
