@@ -15,7 +15,9 @@ All is judged on the true machine by frequency responses and eigenvalues; seeds 
 
 import argparse
 import time
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from design_machines import RESOLUTION, TIMING, Case, case
@@ -191,18 +193,21 @@ def seconds(rng: np.random.Generator, machines: int) -> None:
     print("\nTime of the design for three axes (uncertainty included)")
     paper = truth_model(load_machine("paper-3x3"))
     assert paper is not None
+
+    def timed(what: str, work: Callable[[], object]) -> None:
+        began, cpu = time.perf_counter(), time.process_time()
+        work()
+        print(f"  {what}: {time.perf_counter() - began:.1f} s of wall time, "
+              f"{time.process_time() - cpu:.1f} s of one core", flush=True)  # fmt: skip
+
     for k in range(machines):
         one = case(rng, (3, 3, 3), 0.01)
-        began, cpu = time.perf_counter(), time.process_time()
-        design(one.found, one.sides, one.moves)
-        print(f"  3 x 3 masses, machine {k + 1}: {time.perf_counter() - began:.1f} s of wall time, "
-              f"{time.process_time() - cpu:.1f} s of one core", flush=True)  # fmt: skip
-    began, cpu = time.perf_counter(), time.process_time()
-    design(paper)
-    print(
-        f"  paper-3x3, errors not known: {time.perf_counter() - began:.1f} s of wall time, "
-        f"{time.process_time() - cpu:.1f} s of one core"
-    )
+        for name in ("normal", "stiff"):
+            timed(
+                f"3 x 3 masses, machine {k + 1}, {name}",
+                partial(design, one.found, one.sides, one.moves, response=name),
+            )
+    timed("paper-3x3, errors not known, normal", partial(design, paper))
 
 
 def main() -> None:
