@@ -45,12 +45,12 @@ SMALL = 0.01
 """Error of the torque beyond its noise that does not matter."""
 NEAR_NOISE = 1.5
 """Error over noise (RMS) up to which it is all noise."""
-ENOUGH, ENOUGH_KNOWN, ENOUGH_SURE = 0.9, 0.97, 0.99
+ENOUGH, ENOUGH_KNOWN, ENOUGH_SURE = 0.9, 0.97, 0.98
 """Share of the explainable error that has to be explained for "explained": where the noise is not known,
 where it is, and where it is and the causes' forms are no approximations."""
 SURE_FORMS = (
     "viscous_friction", "gravity", "torque_scale", "torque_lag", "measurement_delay", "extra_mode",
-    "coupling_spring", "coupling_inertia", "structural_damping", "stiffness_change",
+    "coupling_spring", "coupling_inertia",
 )  # fmt: skip
 FALSE_ZERO = 3.0
 """Standard errors of a torque's zero, from which a constant torque is told beside causes."""

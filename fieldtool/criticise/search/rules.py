@@ -8,12 +8,17 @@ from fieldtool.criticise.search.significance import Comparison
 
 CHANCE = 1e-3
 """Largest probability of the gain by chance; dozens of candidates are tried."""
+MOST, CHANCE_OF_MOST = 0.7, 0.02
+"""Who explains so much of what is left may be less sure: where sines are stepped, the error changes so
+slowly that few values of it are independent, and none of many candidates explains most by chance."""
 LEAST_SHARE = 0.04
 """Of what is not explained yet (power, noise taken off): what one cause explains at least."""
 LEAST_SHARE_KNOWN = 0.15
 """The same where the noise is known from repeated periods."""
 LEAST_TORQUE = 1e-3
 """RMS of what a cause explains over that of the torque, below which it does not matter."""
+LEAST_TORQUE_UNSURE = 5e-3
+"""The same where the noise is not known: what is so small may be of anything."""
 BEYOND_NOISE = 1.5
 """Power of an axis' error over the noise, from which there is something to explain."""
 LEAST_SHARE_MORE = 0.4
@@ -119,7 +124,7 @@ def why_not(tried: Tried, context: Context, known_noise: bool, level: float, fur
     further : bool
         Whether the axis has a cause already.
     """
-    if tried.gain.p > CHANCE:
+    if tried.gain.p > (CHANCE_OF_MOST if tried.share >= MOST else CHANCE):
         return "explains no more of the unseen data than chance would"
     if tried.beyond < BEYOND_NOISE and tried.effect.name != "periodic_disturbance":
         return "there is nothing beyond the noise that it could explain"
@@ -128,7 +133,7 @@ def why_not(tried: Tried, context: Context, known_noise: bool, level: float, fur
         least = LEAST_SHARE_MORE if further else LEAST_SHARE_KNOWN
     if tried.share < least:
         return f"explains only {100 * tried.share:.1f} % of what is left on unseen data"
-    if tried.torque < LEAST_TORQUE:
+    if tried.torque < (LEAST_TORQUE if known_noise else LEAST_TORQUE_UNSURE):
         return f"explains {100 * tried.torque:.2g} % of the torque, which does not matter"
     if tried.torque < RELATED * level:
         return "explains no more than what the form of a related effect leaves"
