@@ -164,6 +164,12 @@ def tied(
             enough = tolerance(first.gain)
             if worse.t >= ALIKE_T and worse.before - worse.after > enough:
                 continue
+            ahead = replace(first.gain, after=worse.before)
+            behind = difference(prepared.simulator, current, fitted)
+            if behind.t >= ALIKE_T and behind.before - behind.after > tolerance(ahead):
+                # What was first while other causes were not known is not as good beside them.
+                first, current = replace(rival, fitted=fitted, gain=ahead), fitted
+                continue
             delayed = (
                 rival.effect.name == "measurement_delay" and rival.effect.axis == first.effect.axis
             )
