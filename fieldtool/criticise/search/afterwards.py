@@ -10,7 +10,6 @@ from fieldtool.criticise.effects.friction import friction_candidates
 from fieldtool.criticise.search.fit import Fitted, fit
 from fieldtool.criticise.search.hypothesis import Hypothesis
 from fieldtool.criticise.search.judge import (
-    axis_power,
     difference,
     explained_share,
     explained_torque,
@@ -120,14 +119,11 @@ def unsigned(prepared: Prepared, hypothesis: Hypothesis, effect: Effect, share: 
         effects=hypothesis.effects[:place] + hypothesis.effects[place + 1 :],
         values=hypothesis.values[:place] + hypothesis.values[place + 1 :],
     )
-    power = [
-        sum(
-            axis_power(prepared.simulator.parts(h, role), effect.axis) for role in ("fit", "unseen")
-        )
-        for h in (less, hypothesis)
-    ]
+    # Both shares are of the same errors, all rows counted alike: noise does not weigh them.
+    contexts = [prepared.context(h) for h in (less, hypothesis)]
+    power = [sum(float(np.sum(e[:, effect.axis] ** 2)) for e in c.errors) for c in contexts]
     explains = max(0.0, 1.0 - power[1] / max(power[0], 1e-300))
-    views = views_of(prepared.context(less), effect.axis, effect.seen_by)
+    views = views_of(contexts[0], effect.axis, effect.seen_by)
     best = max((v.share for v in views), default=0.0)
     if best < SHOWN * explains:
         return f"its signature is not there: the error does not show what {effect.name} must leave"
