@@ -11,6 +11,8 @@ from fieldtool.criticise.simulate.motion import FIRST, Motion, differentiate
 
 LONGEST = 0.02
 """s: no delay or lag of a drive is longer."""
+SHORTEST = 0.02
+"""Of a cycle: a shorter delay or lag is none."""
 FEWEST_CYCLES = 8.0
 """Of a disturbance within the shortest experiment."""
 STANDS_OUT = 12.0
@@ -48,6 +50,10 @@ class TorqueLag(Effect):
     contrary = "a delay, whose gain is one at all frequencies; harmonics"
     shows = ("own motion",)
 
+    def implausible(self, values: Values, context: Context) -> str:
+        """Refuse what is small beside a cycle, as of a delay."""
+        return _unnoticed(values["time"], context)
+
     def reported(self, torque: FloatArray, motion: Motion, values: Values) -> FloatArray:
         """Report what has to be asked for; a negative time: the report itself lags."""
         time = values["time"]
@@ -70,6 +76,10 @@ class MeasurementDelay(Effect):
     signature = "a phase in proportion to the frequency, with a gain of one; linear"
     contrary = "harmonics; dependence on amplitude or direction"
     shows = ("own motion",)
+
+    def implausible(self, values: Values, context: Context) -> str:
+        """Refuse what is small beside a cycle: nobody knows the moments of samples that well."""
+        return _unnoticed(values["delay"], context)
 
     def motion(self, motion: Motion, values: Values) -> Motion:
         """Shift the motion of the axis to when it was, by Lagrange interpolation."""
@@ -126,6 +136,13 @@ class PeriodicDisturbance(Effect):
         """Return sine and cosine, of unknown size."""
         phase = 2 * np.pi * values["frequency"] * motion.clock
         return np.sin(phase), np.cos(phase)
+
+
+def _unnoticed(time: float, context: Context) -> str:
+    step = context.motions[0].step
+    if abs(time) >= SHORTEST * step:
+        return ""
+    return f"it would be {1e6 * time:.1f} us, less than samples are exact to"
 
 
 def torque_candidates(context: Context) -> list[Effect]:

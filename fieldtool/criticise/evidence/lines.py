@@ -33,7 +33,7 @@ SMALL = 1e-4
 """Of the torque at a line and around it: nothing smaller is believed (what happens between samples)."""
 UPPER = 0.4
 """Share of the band, at its top, from whose lines noise is taken that repeats with the period."""
-MOST_REPEATED = 10.0
+MOST_REPEATED = 4.0
 """Power of noise that repeats over that of noise that does not: what is more is no noise."""
 AROUND = 12
 """Lines to either side over which noise is averaged."""

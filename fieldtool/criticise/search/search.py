@@ -99,15 +99,12 @@ def search(
     advance("fit the machine without effects", 0.0)
     prepared = replace(prepared, accepted=accepted_base)
     prepared, before = settled(prepared, prepared.start)
-    starts = [before.hypothesis]
-    if accepted_base is not None and _elsewhere(before.hypothesis, accepted_base):
-        starts.insert(0, replace(prepared.start, base=accepted_base))
     current, accepted = before, list[Accepted]()
     rejected: Reasons = {}
     for turn in range(ROUNDS):
         found, seen = _round(
             prepared, current, accepted, without, turn, rejected, advance,
-            starts if turn == 0 else [current.hypothesis],
+            _starts(current.hypothesis, accepted_base),
         )  # fmt: skip
         for effect in seen:
             rejected.setdefault(effect.key, (effect, "leaves no trace of what it must leave"))
@@ -139,10 +136,22 @@ def search(
     )
 
 
+def _starts(found: Hypothesis, accepted: FloatArray | None) -> list[Hypothesis]:
+    """Return from where a cause is looked for: from a fit, and before it from the accepted machine.
+
+    What has no name yet bends a fit, and from there it may look like nothing of the library.
+    """
+    if accepted is None or not _elsewhere(found, accepted):
+        return [found]
+    off = np.array([name in found.off for name in found.machine.names])
+    return [replace(found, base=np.where(off, 0.0, accepted)), found]
+
+
 def _elsewhere(found: Hypothesis, accepted: FloatArray) -> bool:
     """Whether a fit is so far from the accepted machine that effects look different from there."""
     variables = found.machine.variables
     off = np.abs(found.base - accepted) / np.array([v.scale for v in variables])
+    off[[v.name in found.off for v in variables]] = 0.0
     firm = np.array([v.positive or v.name.endswith(".coupling") for v in variables])
     loose = np.array(
         [not f and not v.name.endswith(".offset") for f, v in zip(firm, variables, strict=True)]
