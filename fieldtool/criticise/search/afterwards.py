@@ -162,8 +162,9 @@ def tied(
                 continue
             ahead = replace(first.gain, after=worse.before)
             behind = difference(prepared.simulator, current, fitted)
-            if behind.t >= ALIKE_T and behind.before - behind.after > tolerance(ahead):
-                # What was first while other causes were not known is not as good beside them.
+            lost = behind.t >= ALIKE_T and behind.before - behind.after > tolerance(ahead)
+            if lost and first.effect.name == "measurement_delay":
+                # It went first while other causes were not known, and is not as good beside them.
                 first, current = replace(rival, fitted=fitted, gain=ahead), fitted
                 continue
             delayed = (
