@@ -28,6 +28,9 @@ PEAK_OFF = 0.2
 """Share by which a measured peak of sensitivity may be off the predicted one."""
 CURVE_OFF = 0.35
 """Natural logarithm by which the middle one of all lines' sensitivities may be off: a factor of 1.4."""
+GAINED, FEWEST = (0.2, 0.7), 3
+"""Sensitivities between which a loop's gain shows (above noise, below where all loops come to 1), and
+lines there that are enough: the middle one of their logarithms is the gain of the loop that is off."""
 TIME_OFF, MOVE_OFF = 0.3, 0.05
 """Shares of the predicted settling time, and of the move's own time, by which settling may be off."""
 
@@ -188,6 +191,7 @@ def _unlike(one: Comparison, expected: AxisFigures, after: AxisFigures, cycle: f
         )
     measured, predicted = one.sensitivity_after, one.sensitivity_predicted
     if measured is not None and predicted is not None:
+        found += _gained(measured, predicted)
         with np.errstate(all="ignore"):
             apart = float(np.median(np.abs(np.log(measured.size / predicted.size))))
         if not apart <= CURVE_OFF:  # nor if it is no number
@@ -197,3 +201,18 @@ def _unlike(one: Comparison, expected: AxisFigures, after: AxisFigures, cycle: f
                 "designed"
             )
     return found
+
+
+def _gained(measured: Sensitivity, predicted: Sensitivity) -> list[str]:
+    """Return what the loop's gain says: below its bandwidth a sensitivity is one over it."""
+    lines = (predicted.size > GAINED[0]) & (predicted.size < GAINED[1]) & (measured.size > 0)
+    if np.count_nonzero(lines) < FEWEST:
+        return []
+    off = float(np.median(np.log(predicted.size[lines] / measured.size[lines])))
+    if abs(off) <= CURVE_OFF:
+        return []
+    return [
+        f"its loop has {np.exp(off):.2g} times the gain that was predicted, by its sensitivity below "
+        f"{GAINED[1]:g}; a factor of {np.exp(CURVE_OFF):.2g} is taken: its masses are not the model's, "
+        "or its loop is not the one that was designed"
+    ]

@@ -35,7 +35,7 @@ NOISE_SWINGS = 12.0
 ROUNDED_TARGETS = 3.5
 """Targets are whole counts: their second difference, a cycle squared apart, may swing by so many counts,
 peak to peak, and the inertia that is fed forward makes torque of it."""
-NOT_AS_SAID, FASTER_THAN_SAID = 1.25, 1.5
+NOT_AS_SAID, FASTER_THAN_SAID = 1.25, 1.25
 """Factors by which a peak of sensitivity, and a bandwidth, may be off what the tuning says."""
 STANDSTILL_TIME, STANDSTILL_TIMEOUT = 0.25, 120.0
 STANDSTILL_COUNTS, STANDSTILL_TRAVEL = 3.0, 2e-4

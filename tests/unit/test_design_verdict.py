@@ -79,3 +79,17 @@ def test_nothing_to_compare_with_is_a_fault(believed):
 def test_a_prediction_that_is_believed_has_to_be_there():
     assert told(predicted=None)
     assert told(predicted=None, believed=False) == ()
+
+
+@pytest.mark.parametrize(("factor", "good"), [(1.0, True), (1.2, True), (0.5, False), (2.0, False)])
+def test_a_loop_of_another_gain_is_told_by_its_sensitivity_at_low_frequencies(factor, good):
+    """Though most lines lie where every loop's sensitivity is 1, and the peak is as predicted."""
+    frequency = np.concatenate([np.geomspace(1.0, 4.0, 5), np.geomspace(10.0, 100.0, 30)])
+    size = np.minimum(1.0, 0.15 * frequency)
+    size[15] = 1.5
+    expected = Sensitivity(frequency, size)
+    seen = Sensitivity(frequency, np.where(size < 1, size * factor, size))
+    one = Comparison("x", "rad", 1.0, 0.5, 0.01, GOOD, GOOD, GOOD, None, expected, seen)
+    found = faults(one, 0.001, 2.0, believed=True)
+    assert (found == ()) is good
+    assert good or f"{1 / factor:.2g} times the gain" in found[0]
