@@ -36,17 +36,17 @@ SHARE = 0.2
 """Of the torque that is expected by which it may differ."""
 REMEMBERED = 0.015
 """s, time constant with which what was expected is forgotten."""
-SEEN, OF = 5, 8
+SEEN, OF = 3, 8
 """Differences above what is allowed, of so many cycles, that are enough."""
 TINY = 1e-300
 GLARING, LATELY = 3.0, 0.05
 """Times what is allowed of which two differences are enough, within so many seconds."""
 BLIND, BLIND_AGAIN = 0.015, 0.1
 """s from the beginning of a motion, and from a sample that did not come, in which nothing is said."""
-QUANTA, ENCODER, STILL = 3.0, 4.0, 3.0
+QUANTA, ENCODER, STILL = 3.0, 4.0, 2.5
 """Steps of the torque, times the RMS of what encoders' steps make, and times what was seen while all
 axes stood still, by which torques may differ at any time."""
-LEARNED, LEAST_LEARNED, MOST_LEARNED = 2.5, 0.8, 4.0
+LEARNED, LEAST_LEARNED, MOST_LEARNED = 2.0, 0.8, 4.0
 """Times the difference that was seen with the old parameters that is allowed with the new ones; of the
 usual one at least; and times the usual one above which a drive is not judged."""
 
