@@ -231,9 +231,11 @@ def _still(
     sweep: Expected,
     unseen: float,
     profile: Callable[[], dict[str, Any]] = two_axes,
+    asked_within: float = 200,
 ) -> Row:
     """Return a fault that shows only when the motor must have moved: the position stands still."""
-    asked = stopped("arm: does not move by its encoder: .*brake", unseen=unseen, cycles=300)
+    said = "arm: does not move by its encoder: .*brake"
+    asked = stopped(said, unseen=unseen, cycles=asked_within)
     return Row(name, _one(fault), asked, asked, sweep, NOT_IN_USE, profile)
 
 
@@ -455,6 +457,7 @@ ROWS: tuple[Row, ...] = (
         stopped(PUSHED, unseen=0.07, cycles=60),
         0.03,
         with_coarse_encoder,
+        asked_within=400,
     ),
     Row(
         "encoder jumps",
