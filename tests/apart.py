@@ -53,6 +53,9 @@ Values = Mapping[int, Mapping[tuple[int, int], Any]]
 """By node id and object."""
 
 
+_FORKING = threading.Lock()
+
+
 class SocketcandEnd(can.BusABC):
     """The server's side of ``socketcand`` for one client at a time."""
 
@@ -306,7 +309,8 @@ class MachineApart:
             process: Any = self._context.Process(
                 target=_run_tool, args=(words, str(output), environment), daemon=True
             )
-            process.start()
+            with _FORKING:  # it looks at all others' ends
+                process.start()
             return ToolProcess(process.pid, process, output)
         import subprocess
 
@@ -343,8 +347,11 @@ class ToolProcess:
     def wait(self, seconds: float = 120.0) -> Ended:
         """Wait for its end."""
         if hasattr(self.process, "join"):
-            self.process.join(seconds)
-            code = self.process.exitcode
+            code, deadline = None, time.monotonic() + seconds
+            while code is None and time.monotonic() < deadline:
+                with _FORKING:  # a status can be read once
+                    code = self.process.exitcode
+                time.sleep(0.005)
         else:
             code = self.process.wait(seconds)
         if code is None:
