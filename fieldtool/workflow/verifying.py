@@ -26,11 +26,8 @@ from fieldtool.design.tuning import SOFTEST, Tuning, why_not_stored
 from fieldtool.design.verdict import Comparison, faults
 from fieldtool.errors import IdentificationError, OutputError
 from fieldtool.experiment.axes import Axes
-from fieldtool.experiment.verification.identity import IdentityWatch, Learned
 from fieldtool.experiment.verification.oscillation import HOLD_LEVEL, LOUDEST
 from fieldtool.experiment.verification.trial import Tried, run_trial
-from fieldtool.experiment.verification.watch import Guards
-from fieldtool.experiment.verification.work import WorkRecord, WorkWatch
 from fieldtool.records.model import FloatArray, MachineModel
 from fieldtool.records.recording import Experiment, RecordingWriter
 from fieldtool.records.yaml_file import write_yaml
@@ -43,14 +40,13 @@ from fieldtool.report.verification_picture import (
 from fieldtool.workflow.preparation import axes_of, recording_header, setting_of
 from fieldtool.workflow.rescued import keeping
 from fieldtool.workflow.session import Session
-from fieldtool.workflow.trial_loops import drive_loop
+from fieldtool.workflow.trial_guards import TrialGuards
 from fieldtool.workflow.trial_plan import (
     TrialPlan,
     encoder_swing,
     plan_trial,
     torque_steps,
     wait_for_standstill,
-    without_feed_forward,
 )
 from fieldtool.workflow.trial_records import TrialRecords
 from fieldtool.workflow.verified import Verified
@@ -98,9 +94,7 @@ class Verification:
         self._plan: TrialPlan | None = None
         self._changes: tuple[Change, ...] = ()
         self._old: Tried | None = None
-        self._identity: IdentityWatch | None = None
-        self._learned: Learned | None = None
-        self._works = WorkRecord()
+        self._guards: TrialGuards | None = None
         self._recorder: RecordingWriter | None = None
         self._histories: list[tuple[Comparison, History, History]] = []
         self.result: Verified | None = None
@@ -199,11 +193,6 @@ class Verification:
             raise OutputError(f"{path}: can not be removed ({error.strerror})") from error
 
     @property
-    def _speeds(self) -> FloatArray:
-        inertia = [sum(mass.value for mass in axis.masses) for axis in self._setting.model.axes]
-        return np.array(inertia) / self._planned.trial.cycle_time**2
-
-    @property
     def _records(self) -> TrialRecords:
         return TrialRecords(self._planned, self._axes, self._setting.model)
 
@@ -218,7 +207,8 @@ class Verification:
         cycle = self._planned.trial.cycle_time
         pairs = zip(self._group.drives, servos, strict=True)
         wait_for_standstill(self._group)
-        guards = self._guards(servos)
+        if self._guards is None:
+            self._guards = TrialGuards(self._group, self._axes, cycle, self._session.warn)
         tried = run_trial(
             self._group,
             self._planned.trial,
@@ -229,37 +219,12 @@ class Verification:
             louder=self._louder(servos),
             steps=np.array([torque_steps(drive, servo, cycle) for drive, servo in pairs]),
             sags=None if self._old is None else self._old.sags,
-            guards=guards,
+            guards=self._guards.of(servos, self._old),
             report=self._session.screen.progress,
             exciting=partial(self._ready_to_excite, servos),
         )
-        if self._learned is None and self._identity is not None:
-            self._learned = self._identity.learned()
+        self._guards.learn()
         return tried
-
-    def _guards(self, servos: Sequence[Servo]) -> Guards:
-        """Return what compares torques with these controllers; while the old ones act it only learns."""
-        drives = self._group.drives
-        quanta = np.array([abs(drive.scaling.torque) for drive in drives])
-        identity = IdentityWatch(
-            [drive_loop(*pair) for pair in zip(drives, servos, strict=True)],
-            self._planned.trial.cycle_time,
-            quanta,
-            self._learned,
-            [drive.torque_unit for drive in drives],
-        )
-        self._identity = identity
-        if self._learned is None or self._old is None:
-            return Guards(identity, self._works)
-        for drive, why in zip(drives, identity.why_not, strict=True):
-            if why:
-                self._session.warn(
-                    f"{drive.axis}: whether the controller in its drive is the one that was written can "
-                    f"not be told from its torque: {why}. Swings, ways and torques are watched as ever."
-                )
-        limits = np.array([one.torque for one in self._axes.limits])
-        known = self._old.rest, self._axes.counts, limits, quanta, self._speeds, self._axes.units
-        return Guards(identity, WorkWatch(*known, self._works.most(WorkWatch(*known))))
 
     @contextmanager
     def _ready_to_excite(self, servos: Sequence[Servo]) -> Iterator[None]:
@@ -268,10 +233,8 @@ class Verification:
         by_reference = lines is not None and not np.all(lines.by_torque)
         wait_for_standstill(self._group)
         with self._group.without_feed_forward() if by_reference else nullcontext():
-            if by_reference and self._identity is not None:
-                pairs = zip(self._group.drives, servos, strict=True)
-                bare = ((d, replace(s, loop=without_feed_forward(d, s))) for d, s in pairs)
-                self._identity.use([drive_loop(*pair) for pair in bare])
+            if by_reference and self._guards is not None:
+                self._guards.without_feed_forward(servos)
             yield
 
     def _louder(self, servos: Sequence[Servo]) -> FloatArray:

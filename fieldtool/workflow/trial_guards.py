@@ -1,0 +1,76 @@
+"""What compares a trial's drives with what was written: learns from the old ones, judges the new."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from drives.canopen_drive import CanopenGroup
+from fieldtool.design.servo import Servo
+from fieldtool.experiment.axes import Axes
+from fieldtool.experiment.verification.identity import IdentityWatch, Learned
+from fieldtool.experiment.verification.trial import Tried
+from fieldtool.experiment.verification.watch import Guards
+from fieldtool.experiment.verification.work import WorkRecord, WorkWatch
+from fieldtool.workflow.trial_loops import drive_loop
+from fieldtool.workflow.trial_plan import without_feed_forward
+
+
+class TrialGuards:
+    """The guards of both trials of one write.
+
+    Parameters
+    ----------
+    group
+        Of the machine.
+    axes
+        Names, limits, counts, inertias.
+    cycle_time
+        Seconds.
+    warn
+        Is told which drives can not be judged, a sentence each.
+    """
+
+    def __init__(
+        self, group: CanopenGroup, axes: Axes, cycle_time: float, warn: Callable[[str], None]
+    ) -> None:
+        self._group, self._axes, self._step, self._warn = group, axes, cycle_time, warn
+        self._works = WorkRecord()
+        self._identity: IdentityWatch | None = None
+        self._learned: Learned | None = None
+
+    def of(self, servos: Sequence[Servo], old: Tried | None) -> Guards:
+        """Return guards that compare torques with these controllers.
+
+        While the old parameters act (``old`` is None) they only learn.
+        """
+        drives = self._group.drives
+        quanta = np.array([abs(drive.scaling.torque) for drive in drives])
+        units = [drive.torque_unit for drive in drives]
+        loops = [drive_loop(*pair) for pair in zip(drives, servos, strict=True)]
+        self._identity = IdentityWatch(loops, self._step, quanta, self._learned, units)
+        if self._learned is None or old is None:
+            return Guards(self._identity, self._works)
+        for drive, why in zip(drives, self._identity.why_not, strict=True):
+            if why:
+                self._warn(
+                    f"{drive.axis}: whether the controller in its drive is the one that was written can "
+                    f"not be told from its torque: {why}. Swings, ways and torques are watched as ever."
+                )
+        axes = self._axes
+        limits = np.array([one.torque for one in axes.limits])
+        inertia = np.zeros(limits.size) if axes.inertia is None else axes.inertia
+        known = old.rest, axes.counts, limits, quanta, inertia / self._step**2, axes.units
+        return Guards(self._identity, WorkWatch(*known, self._works.most(WorkWatch(*known))))
+
+    def without_feed_forward(self, servos: Sequence[Servo]) -> None:
+        """Go on with controllers whose feed-forward is switched off, where it can be."""
+        if self._identity is not None:
+            pairs = zip(self._group.drives, servos, strict=True)
+            bare = ((d, replace(s, loop=without_feed_forward(d, s))) for d, s in pairs)
+            self._identity.use([drive_loop(*pair) for pair in bare])
+
+    def learn(self) -> None:
+        """The trial of the old parameters has ended: what was seen is what is usual."""
+        if self._learned is None and self._identity is not None:
+            self._learned = self._identity.learned()
