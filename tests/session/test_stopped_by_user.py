@@ -16,6 +16,7 @@ from drives.canopen_drive.interrupts import SIGNALS, uninterrupted
 from drives.errors import UserStopError
 from drives.sim.faults import Fault
 from fieldtool import workflow
+from fieldtool.cli.output import nobody_reads
 from fieldtool.records.recording import load
 from fieldtool.workflow import Options
 
@@ -219,3 +220,21 @@ def test_an_error_on_its_way_is_not_replaced():
 
     with pytest.raises(UserStopError, match="first"):
         fail_and_clean_up()
+
+
+def test_an_output_that_is_closed_while_axes_move_stops_them(bench, monkeypatch):
+    moving = []
+
+    def closed(_screen, _progress):
+        moving.append(bench.powered())
+        nobody_reads()
+
+    monkeypatch.setattr("fieldtool.cli.output.drop_output", lambda: None)
+    monkeypatch.setattr("fieldtool.cli.screen.TerminalScreen.progress", closed)
+    outcome = bench.run("--yes")
+    assert outcome.code == 130
+    assert "the output was closed before its end: stopped." in outcome.err
+    assert len(moving) == 1
+    assert moving[0], "it came while the axes were on"
+    assert bench.recording().experiments
+    is_safe(bench)
