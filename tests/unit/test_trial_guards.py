@@ -180,6 +180,16 @@ def test_a_drive_whose_old_torque_did_not_follow_from_its_parameters_is_not_judg
     assert first_alarm(after, position, torque, target) is None
 
 
+@pytest.mark.parametrize("spike", [-3.5, 2.0])
+def test_what_enabling_did_to_the_first_torque_is_no_difference(spike):
+    """The target steps by a count when a drive is enabled: its feed-forward kicks for a cycle or two."""
+    target, _ = trial_path(GOOD)
+    position, torque = Axis(GOOD).run(target, 0.02, 3)
+    torque = np.array(torque, dtype=float)
+    torque[:2] += [spike, -0.5 * spike]
+    assert first_alarm(watch(GOOD, noise=0.02), position, torque, target) is None
+
+
 def test_nothing_is_said_of_gains_that_nobody_can_read():
     target, _ = trial_path(GOOD)
     position, torque = Axis(replace(GOOD, velocity_p=10 * GOOD.velocity_p)).run(target)

@@ -221,6 +221,8 @@ class IdentityWatch:
             allowed = allowed + STILL * self._still  # noise is no share of anything
         self._count += 1
         if self._count <= self._blind:
+            # what enabling did to the torque, as at the first sample, is not theirs to explain
+            self._quick[2] = expected
             return []
         self._over = [*self._over[1 - OF :], difference / allowed]
         self._far = [*self._far[1 - OF :], difference]
