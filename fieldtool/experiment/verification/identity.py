@@ -39,6 +39,8 @@ REMEMBERED = 0.015
 SEEN, OF = 3, 8
 """Differences above what is allowed, of so many cycles, that are enough."""
 TINY = 1e-300
+EXPLAINS = 0.06
+"""Share of the differences' squares that being late has to explain to be believed."""
 GLARING, LATELY = 3.0, 0.05
 """Times what is allowed of which two differences are enough, within so many seconds."""
 BLIND, BLIND_AGAIN = 0.015, 0.1
@@ -103,7 +105,7 @@ class IdentityWatch:
         self._units = tuple(units) or ("",) * m
         self._quanta = quanta
         self._still, self._share = np.zeros(m), np.zeros(m)
-        self._lateness = np.zeros((2, m))
+        self._lateness = np.zeros((3, m))
         self._passed = SETTLES / (SETTLES + step)
         self._kept = exp(-step / REMEMBERED)
         self._standing = True
@@ -157,8 +159,9 @@ class IdentityWatch:
 
     def learned(self) -> Learned:
         """Return what was seen so far."""
-        along, square = self._lateness
-        late = np.abs(along) / np.maximum(square, TINY)
+        along, square, whole = self._lateness
+        explains = along**2 > EXPLAINS * square * whole
+        late = np.where(explains, np.abs(along) / np.maximum(square, TINY), 0.0)
         return Learned(self._still.copy(), self._share.copy(), late)
 
     def take(
@@ -213,7 +216,7 @@ class IdentityWatch:
         expected = quick[0] + quick[1]
         difference = np.abs(quick[2] - expected)
         if self._learned is None and not self._standing:
-            self._lateness += (turns * (quick[2] - expected), turns**2)
+            self._lateness += (turns * (quick[2] - expected), turns**2, difference**2)
         self._peak = np.maximum(np.abs(expected), self._kept * self._peak)
         self._slope = np.maximum(slope, self._kept * self._slope)
         allowed = self._floor + SHARE * self._peak + (self._late * self._slope).sum(axis=0)
