@@ -101,7 +101,7 @@ def test_sigkill_in_motion_stops_every_drive_by_its_own_heartbeat_consumer(
 
 def in_the_pilot(master, listener) -> None:
     """Return about two seconds after the pilot experiment, of nine, began to move the axes."""
-    master.wait_for("experiment 1/1: pilot")
+    master.wait_for("1/1 pilot")
     listener.wait_for_motion(master, TABLE, rows=200, way=0.02)
 
 
