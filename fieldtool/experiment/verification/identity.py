@@ -41,8 +41,6 @@ SEEN, OF = 3, 8
 TINY = 1e-300
 EXPLAINS = 0.06
 """Share of the differences' squares that being late has to explain to be believed."""
-GLARING, LATELY = 3.0, 0.05
-"""Times what is allowed of which two differences are enough, within so many seconds."""
 BLIND, BLIND_AGAIN = 0.015, 0.1
 """s from the beginning of a motion, and from a sample that did not come, in which nothing is said."""
 QUANTA, ENCODER, STILL = 3.0, 4.0, 2.5
@@ -197,7 +195,6 @@ class IdentityWatch:
         self._peak, self._slope = np.zeros(m), np.zeros((2, m))
         self._over: list[FloatArray] = []
         self._far: list[FloatArray] = []
-        self._glared = np.full(m, -np.inf)
         self._count = 0
 
     def _compare(self) -> list[tuple[int, str]]:
@@ -238,12 +235,9 @@ class IdentityWatch:
         if self._learned is None:
             self._learn(over, np.sort(np.array(self._far), axis=0)[-SEEN])
             return []
-        glares = self._over[-1] > GLARING * self._scale
-        again = glares & (self._count - self._glared < LATELY / self._step)
-        self._glared = np.where(glares, self._count, self._glared)
         return [
             (k, self._sentence(k, float(self._scale[k] * allowed[k])))
-            for k in np.flatnonzero((over > self._scale) | again).tolist()
+            for k in np.flatnonzero(over > self._scale).tolist()
             if self._judged[k]
         ]
 
