@@ -1,6 +1,7 @@
 """Carry a write-back out on the drives, step by step as the journal's rules say, or take it back."""
 
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 
 from drives.canopen_drive.interrupts import uninterrupted
 from drives.errors import (
@@ -256,7 +257,8 @@ class Transaction:
         for outcome in self.outcomes.values():
             outcome.trouble = ""
         while (step := next_step(self.journal, given_up)) is not None:
-            self._tell(step)
+            with suppress(Exception):  # nobody to hear it is no reason to leave drives as they are
+                self._tell(step)
             self._go_quietly(self.journal.began(step))
             try:
                 if step.action is Action.FINISH:

@@ -20,6 +20,8 @@ GAP_SHARE = 0.3
 """Of a spring with backlash: how stiff it is for motions a little larger than the gap."""
 BENT = 0.2
 """Relative change of a spring that hardens or softens."""
+MOST_KNOWN = 2.0
+"""Relative error that is reckoned with at most: beyond it nothing but the order of size is known."""
 TRIES = 50
 
 
@@ -81,7 +83,7 @@ def _numbers(model: MachineModel, rng: np.random.Generator) -> dict[str, Estimat
     out = {}
     for name, one in numbers.items():
         least, unknown = _floors(name)
-        known = one.std / abs(one.value) if isfinite(one.std) else unknown
+        known = min(one.std / abs(one.value), MOST_KNOWN) if isfinite(one.std) else unknown
         besides = sqrt(max(least**2 - known**2, 0.0))
         off = known * normal[name] + besides * _normal(rng)
         factor = 1 + off if name.startswith("coupling") else exp(off)

@@ -132,14 +132,15 @@ def _prove(motion: Motion, axes: Axes, start: FloatArray, keep: Keep) -> tuple[b
     """See that every encoder counts; return of which it is sure."""
     allowed = _astray(axes) + CHECK_COUNTS * axes.counts
     quiet = np.maximum(PROOF_SHOWN * axes.counts, PROOF_QUIET * allowed)
-    proven, farthest = [], 0.0
+    proven, ways = [], np.zeros(len(axes.names))
     for k, name in enumerate(axes.names):
 
-        def judge(position: FloatArray, way: float) -> None:
-            nonlocal farthest
-            farthest = max(farthest, way)
+        def judge(position: FloatArray, way: float, k: int = k) -> None:
+            ways[k] = max(ways[k], way)
             for j, other in enumerate(axes.names):
-                most = float(allowed[j]) + PUSHED_WAY * farthest
+                most = float(allowed[j]) + PUSHED_WAY * float(ways[j])
+                if j != k:  # the pulses of another shake it
+                    most = max(most, CHECK_PUSHED * float(allowed[j]))
                 _DirectionCheck.stay(other, float(position[j] - start[j]), 0.0, most, axes.unit(j))
 
         proof = Proof(axes, k, start, motion.cycle_time, quiet, judge)

@@ -56,9 +56,10 @@ def pulses(
     duration = min(sqrt(2 * pi * float(axes.inertia[k]) * shown / net), PROOF_LONGEST)
     rows = max(PROOF_ROWS, ceil(duration / step))
     torques = [share * limits.torque for share in PROOF_SHARES]
-    if by_offset:
-        return tuple((torque, rows) for torque in torques)
     room = min(stands - limits.travel[0], limits.travel[1] - stands)
+    if by_offset:
+        far = (rows * step) ** 2 / (2 * pi * float(axes.inertia[k]))  # for 1 N m or N
+        return tuple((torque, rows) for torque in torques if 2 * torque * far <= room)
     widest = min(PROOF_ERROR * limits.following_error, room)
     found: list[tuple[float, int]] = []
     for torque in torques:
@@ -119,6 +120,8 @@ class Proof:
         self._path, self._ends = np.concatenate(parts), ends
         self._longest = sizes[-1][1] * step if sizes else 0.0
         self._ways = [0.0, *(self._way(size, rows * step) for size, rows in sizes)]
+        stiffness = 1.0 if self._by_offset or axes.stiffness is None else float(axes.stiffness[k])
+        self._torques = [stiffness * size for size, _ in sizes]
         self._done, self._torque = 0, 0.0
         self._resting: list[float] = []
         self._pulls: list[float] = []
@@ -131,14 +134,23 @@ class Proof:
         """Return the next targets; None when the pulse in which it answered has ended."""
         if before is not None:
             self._look(before)
-        if self._done >= self._path.size:
-            self._refuse()
-            return None
         if self.answered and self._done in self._ends:
             return self._come_to_rest()
+        if self._done >= self._path.size or self._too_much():
+            self._refuse()
+            return None
         until = min(self._done + PROOF_SLICE, next(end for end in self._ends if end > self._done))
         part, self._done = self._path[self._done : until], until
         return self._targets(part)
+
+    def _too_much(self) -> bool:
+        """Whether the next pulse, on top of what the axis holds already, is beyond its torque limit."""
+        if self._done not in self._ends:
+            return False
+        holds = abs(float(np.mean(self._pulls)))
+        return (
+            holds + self._torques[self._ends.index(self._done)] > self._axes.limits[self._k].torque
+        )
 
     def _targets(self, part: FloatArray) -> FloatArray | Targets:
         targets = np.tile(self._stands, (part.size, 1))

@@ -92,6 +92,8 @@ class Correlation:
             raise ValueError("correlation needs one row a name, of 1, 2, 3 ... numbers")
         if any(abs(number) > 1 for row in self.rows for number in row):
             raise ValueError("correlation has a number outside of -1 to 1")
+        if any(row[-1] != 1 for row in self.rows):
+            raise ValueError("each row of correlation has to end with 1")
 
     @property
     def matrix(self) -> FloatArray:

@@ -8,12 +8,15 @@ import numpy as np
 from drives.canopen_drive import CanopenGroup
 from fieldtool.design.servo import Servo
 from fieldtool.experiment.axes import Axes
-from fieldtool.experiment.verification.identity import IdentityWatch, Learned
+from fieldtool.experiment.verification.identity import LEAST_SEEN, IdentityWatch, Learned
 from fieldtool.experiment.verification.trial import Tried
 from fieldtool.experiment.verification.watch import Guards
 from fieldtool.experiment.verification.work import WorkRecord, WorkWatch
 from fieldtool.workflow.trial_loops import drive_loop
 from fieldtool.workflow.trial_plan import without_feed_forward
+
+MOST_MISSING = 10.0
+"""Times the usual that work may be missing with the old parameters; beyond it a person is told."""
 
 
 class TrialGuards:
@@ -61,7 +64,14 @@ class TrialGuards:
         limits = np.array([one.torque for one in axes.limits])
         inertia = np.zeros(limits.size) if axes.inertia is None else axes.inertia
         known = old.rest, axes.counts, limits, quanta, inertia / self._step**2, axes.units
-        return Guards(self._identity, WorkWatch(*known, self._works.most(WorkWatch(*known))))
+        missing = self._works.most(WorkWatch(*known))
+        if missing > MOST_MISSING:
+            self._warn(
+                "whether motors push the way that they are asked to is hardly told: with the old "
+                f"parameters {missing:.3g} times as much work was missing as is usual. Swings, ways and "
+                "torques are watched as ever."
+            )
+        return Guards(self._identity, WorkWatch(*known, min(missing, MOST_MISSING)))
 
     def without_feed_forward(self, servos: Sequence[Servo]) -> None:
         """Go on with controllers whose feed-forward is switched off, where it can be."""
@@ -71,6 +81,14 @@ class TrialGuards:
             self._identity.use([drive_loop(*pair) for pair in bare])
 
     def learn(self) -> None:
-        """The trial of the old parameters has ended: what was seen is what is usual."""
-        if self._learned is None and self._identity is not None:
+        """A trial has ended: what was seen of the old parameters is what is usual."""
+        if self._identity is None:
+            return
+        if self._learned is None:
             self._learned = self._identity.learned()
+        elif self._identity.seen < LEAST_SEEN:
+            self._warn(
+                f"late cycles left {100 * self._identity.seen:.0f} % of the trial to compare torques "
+                "with what the new parameters make of target and position: whether the controllers are "
+                "those that were written is hardly told. Swings, ways and torques were watched as ever."
+            )

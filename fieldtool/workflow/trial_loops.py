@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from drives.api import AxisLimits
 from drives.canopen_drive import CanopenDrive
 from drives.errors import DrivesError
 from drives.parameters import read_parameters
@@ -21,8 +22,9 @@ ANSWER, MOST_ANSWER, CLEAR = 0.05, 0.3, 10.0
 """Shares of the torque limit that a first answer is to take at least and at most; and times the RMS of
 what the encoder's steps make."""
 FEWEST_CYCLES = 4
-MOST_WAY = 0.02
-"""Share of the move that a first answer goes, at most."""
+MOST_WAY, MOST_ERROR, MOST_VELOCITY = 0.02, 0.25, 0.8
+"""Shares of the move, of the following error limit, and of the velocity limit that a first answer may
+take."""
 
 
 def drive_loop(drive: CanopenDrive, servo: Servo) -> DriveLoop:
@@ -61,7 +63,11 @@ def _why_not_told(drive: CanopenDrive) -> str:
 
 
 def first_answer(
-    loops: Sequence[DriveLoop], counts: float, limit: float, distance: float, cycle: float
+    loops: Sequence[DriveLoop],
+    counts: float,
+    limits: AxisLimits,
+    distance: float,
+    cycle: float,
 ) -> FloatArray:
     """Return a path of some counts to and fro that no loop answers with much torque, shape (n,).
 
@@ -74,8 +80,8 @@ def first_answer(
         That it will meet.
     counts
         One count of the encoder, rad or m.
-    limit
-        Of the torque, N m or N.
+    limits
+        Of the axis: torque, following error, velocity.
     distance
         Of the move that comes later, rad or m.
     cycle
@@ -87,10 +93,15 @@ def first_answer(
     padded = np.concatenate([path, np.zeros(2 * n)])
     most = max(float(np.abs(locked_torque(loop, padded, cycle)).max()) for loop in loops)
     noise = max(loop.noise for loop in loops)
-    wanted = min(max(ANSWER * limit, CLEAR * noise), MOST_ANSWER * limit)
-    times = np.floor(min(wanted / max(most, 1e-300), MOST_WAY * abs(distance) / path.max()))
+    wanted = min(max(ANSWER * limits.torque, CLEAR * noise), MOST_ANSWER * limits.torque)
+    fastest = float(np.abs(np.diff(path)).max()) / cycle
+    room = min(
+        MOST_ERROR * limits.following_error / path.max(), MOST_VELOCITY * limits.velocity / fastest
+    )
+    times = np.floor(min(wanted / max(most, 1e-300), MOST_WAY * abs(distance) / path.max(), room))
     if times < 1:
-        if most > MOST_ANSWER * limit or path.max() > 10 * MOST_WAY * abs(distance):
+        far = path.max() > 10 * MOST_WAY * abs(distance)
+        if most > MOST_ANSWER * limits.torque or far or room < 1:
             return np.zeros(0)
         times = 1.0
     answer: FloatArray = np.copysign(times, distance) * path

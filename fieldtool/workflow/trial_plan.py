@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from drives.api import AxisLimits
 from drives.canopen_drive import CanopenDrive, CanopenGroup
 from drives.parameters import Change, read_loop, read_parameters
 from fieldtool.design.moves import TestMove
@@ -182,7 +183,7 @@ def plan_trial(
         for k, drive in enumerate(group.drives)
     ]
     answers = [
-        _answer(drive, (old[k], new[k]), float(limits[k]), moves[k].distance, cycle)
+        _answer(drive, (old[k], new[k]), setting.limits[k], moves[k].distance, cycle)
         for k, drive in enumerate(group.drives)
     ]
     unasked = [
@@ -207,11 +208,11 @@ def plan_trial(
 
 
 def _answer(
-    drive: CanopenDrive, servos: Sequence[Servo], limit: float, distance: float, cycle: float
+    drive: CanopenDrive, servos: Sequence[Servo], limits: AxisLimits, distance: float, cycle: float
 ) -> tuple[FloatArray, float]:
     """Return the path by which an axis' controller is known, and the torque that it takes."""
     loops = [drive_loop(drive, servo) for servo in servos]
-    answer = first_answer(loops, abs(drive.scaling.position), limit, distance, cycle)
+    answer = first_answer(loops, abs(drive.scaling.position), limits, distance, cycle)
     return answer, answer_torque(loops, answer, cycle)
 
 

@@ -2,6 +2,7 @@
 
 import struct
 from dataclasses import dataclass, replace
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -121,6 +122,26 @@ def test_good_loops_stand_the_trial_and_everything_is_recorded(bench):
     assert np.all(tried.noise < 0.5)
     assert bench.powered() == {}
     assert bench.changed() == {}
+
+
+@pytest.mark.parametrize("trusts_loops", [False, True])
+def test_a_person_who_stops_a_trial_gets_the_power_cut_at_once(bench, trusts_loops):
+    """New loops are no brake: a quick stop is left only to those that are known."""
+    asked = []
+    receive = bench.machine.receive
+
+    def heard(cob_id, data):
+        if 0x200 < cob_id < 0x280:
+            asked.append(struct.unpack("<H", data[:2])[0])
+        return receive(cob_id, data)
+
+    begun = bench.machine.sync_count
+    with patch.object(bench.machine, "receive", heard), pytest.raises(UserStopError):
+        try_it(bench, [], lambda: bench.machine.sync_count > begun + 900, trusts_loops)
+    assert bench.powered() == {}
+    assert bench.changed() == {}
+    assert any(word & 0xF == 0xF for word in asked)
+    assert any(word & 0x6 == 0x2 for word in asked) == trusts_loops, "a quick stop"
 
 
 def disaster(bench, fault, after):

@@ -370,6 +370,14 @@ def test_drawn_machines_err_together_as_the_model_says() -> None:
         assert masses.sum(axis=1).std() == pytest.approx(spread, rel=0.3)
 
 
+def test_a_number_that_is_all_but_unknown_is_drawn_all_the_same() -> None:
+    chain = AxisModel(
+        "x", "rotary", (Estimate(1.0), Estimate(1.0)), (Estimate(500.0),), (Estimate(1e-9, 1e-3),)
+    )
+    drawn = samples_of(MachineModel((chain,)), 50, np.random.default_rng(1))
+    assert all(0 < one.axes[0].dampers[0].value < 1e-6 for one in drawn)
+
+
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("damping", [0.0, 0.05, 0.2])
 def test_shapers_cancel_their_vibration(name: str, damping: float) -> None:

@@ -217,6 +217,7 @@ AXIS: dict[str, Any] = {"name": "x", "kind": "rotary", "masses": [1], "springs":
         (changed(correlation={"names": ["x.mass[1]"], "rows": [[1.0, 0]]}), "one row a name"),
         (changed(correlation={"names": ["x.mass[1]"] * 2, "rows": [[1], [0, 1]]}), "number twice"),
         (changed(correlation={"names": ["x.mass[1]"], "rows": [[1.5]]}), "outside of -1 to 1"),
+        (changed(correlation={"names": ["x.mass[1]"], "rows": [[0.5]]}), "has to end with 1"),
     ],
 )
 def test_what_is_no_model_is_refused(data: dict[str, Any], words: str) -> None:

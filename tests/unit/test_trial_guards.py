@@ -12,9 +12,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from drives.api import AxisLimits
 from fieldtool.design.servo import Servo, Timing
 from fieldtool.experiment.verification.controller import DriveLoop, ExpectedTorque, locked_torque
 from fieldtool.experiment.verification.identity import BLIND, IdentityWatch, Learned
+from fieldtool.experiment.verification.watch import Guards, TrialWatch
 from fieldtool.experiment.verification.work import WorkWatch
 from fieldtool.records.closed_loop import AxisLoop, Biquad
 from fieldtool.workflow.trial_loops import first_answer
@@ -22,7 +24,20 @@ from fieldtool.workflow.trial_loops import first_answer
 STEP, PERIOD, LAG = 1e-3, 0.125e-3, 0.16e-3
 COUNT = 2 * np.pi / 2**20
 INERTIA, LIMIT = 0.5, 40.0
+LIMITS = AxisLimits((-3.0, 3.0), 3.0, 60.0, LIMIT, 0.5)
 GOOD = AxisLoop(30.0, 60.0 * INERTIA, 60.0 * 15.0 * INERTIA, 1.0, 0.9 * INERTIA)
+
+
+class Blind:
+    """A watch for swings that sees none."""
+
+    trusts_loops = False
+
+    def begin(self):
+        """Nothing is kept."""
+
+    def take(self, position, torque):
+        """Say nothing."""
 
 
 @dataclass
@@ -88,7 +103,7 @@ def drive(loop, **changes):
 
 
 def trial_path(loop, count=COUNT, hold=100):
-    answer = first_answer([drive(loop)], count, LIMIT, 0.5, STEP)
+    answer = first_answer([drive(loop)], count, LIMITS, 0.5, STEP)
     u = np.arange(200) * STEP / 0.2
     nudge = np.round(0.01 * u**3 * (10 - 15 * u + 6 * u * u) / count) * count
     return np.concatenate(
@@ -275,3 +290,35 @@ def test_a_motor_that_pushes_the_wrong_way_is_found_while_its_torque_is_small(ba
     row, text = found
     assert "against its own torque" in text
     assert np.abs(torque[:row]).max() < 0.3 * LIMIT
+
+
+def test_who_hardly_saw_the_old_controllers_does_not_judge_the_new_ones():
+    path = np.zeros(600)
+    for every, judged in ((10**6, True), (50, False)):
+        learning = IdentityWatch([drive(GOOD)], STEP, np.array([0.01]))
+        for n in range(path.size):
+            learning.take([0.0], [0.0], [0.0], [0.0], fresh=n % every != every - 1)
+        learned = learning.learned()
+        assert (learned.seen > 0.5) == judged
+        assert (watch(GOOD, learned).why_not == ("",)) == judged
+
+
+@pytest.mark.parametrize(("error", "velocity"), [(1e-4, 3.0), (0.5, 0.02)])
+def test_a_first_answer_keeps_following_error_and_velocity(error, velocity):
+    limits = replace(LIMITS, following_error=error, velocity=velocity)
+    soft = AxisLoop(5.0, 0.05 * INERTIA, 0.0, 0.0)
+    free, kept = (first_answer([drive(soft)], COUNT, one, 3.0, STEP) for one in (LIMITS, limits))
+    assert np.abs(free).max() > error or np.abs(np.diff(free)).max() > velocity * STEP
+    assert np.abs(kept).max(initial=0.0) <= 0.25 * error
+    assert np.abs(np.diff(kept)).max(initial=0.0) <= 0.8 * velocity * STEP * (1 + 1e-9)
+
+
+def test_a_lost_sample_ends_what_is_reckoned_of_work():
+    work = WorkWatch(
+        *(np.array([one]) for one in (0.0, COUNT, LIMIT, 1e-3 * LIMIT, INERTIA / STEP**2)), ["rad"]
+    )
+    guarded = TrialWatch(["x"], Blind(), Guards(watch(GOOD), work))
+    guarded.begin()
+    for n in range(200):
+        guarded.take([n * COUNT], [-5.0], [0.0], [0.0], fresh=n % 20 != 19)
+        assert n % 20 != 19 or work.missing == 0.0

@@ -32,7 +32,7 @@ from drives.parameters import (
     load_journal,
     save_journal,
 )
-from drives.parameters.journal import State
+from drives.parameters.journal import Action, State
 from drives.profile import load_drive
 from fieldtool.writeback.restoring import Source, journal_back
 
@@ -318,6 +318,22 @@ def test_a_memory_is_trusted_only_after_the_answer():
         if world.drives[0].nvm != values_of(0):
             assert world.saved is not None
             assert world.saved.drives[0].memory in (Memory.UNKNOWN, Memory.NEW)
+
+
+def test_who_hears_of_storing_can_not_stop_what_is_brought_back():
+    """A screen whose output is full or closed."""
+    for at in range(1, 40):
+        world, journal, backup = made(2, Storing.ALL, {at: Event("refused")})
+        told = []
+
+        def deaf(step, told=told):
+            told.append(step)
+            if told[-1].action is Action.STORE and len(told) > 3:
+                raise OSError("No space left on device")
+
+        with suppress(WriteBackError, OSError):
+            Transaction(world.drives, journal, backup, world.save, deaf).write()
+        assert all_hold(world, 0) or all_hold(world, 5)
 
 
 class Stumbling(FakeDrive):

@@ -46,6 +46,8 @@ BLIND, BLIND_AGAIN = 0.015, 0.1
 QUANTA, ENCODER, STILL = 3.0, 4.0, 2.5
 """Steps of the torque, times the RMS of what encoders' steps make, and times what was seen while all
 axes stood still, by which torques may differ at any time."""
+LEAST_SEEN = 0.5
+"""Share of its cycles that have to be compared for a trial to tell anything of controllers."""
 LEARNED, LEAST_LEARNED, MOST_LEARNED = 2.0, 0.8, 4.0
 """Times the difference that was seen with the old parameters that is allowed with the new ones; of the
 usual one at least; and times the usual one above which a drive is not judged."""
@@ -61,9 +63,14 @@ class Learned:
     """Largest lasting difference of all, over what is usually allowed."""
     late: FloatArray
     """s, by which torques answered positions later or earlier than they should, by least squares."""
+    seen: float = 1.0
+    """Share of the cycles that were compared."""
 
     def why_not(self) -> tuple[str, ...]:
         """Return for each axis why it can not be judged by what was seen; empty where it can."""
+        if self.seen < LEAST_SEEN:
+            why = f"late cycles left {100 * self.seen:.0f} % of the trial of its old parameters"
+            return (why,) * self.share.size
         return tuple(
             f"with its old parameters its torque was up to {share:.2g} times as far from what they make "
             "of target and position as is usual"
@@ -107,6 +114,7 @@ class IdentityWatch:
         self._passed = SETTLES / (SETTLES + step)
         self._kept = exp(-step / REMEMBERED)
         self._standing = True
+        self._taken = self._compared = 0
         self.use(loops)
 
     def use(self, loops: Sequence[DriveLoop]) -> None:
@@ -155,12 +163,17 @@ class IdentityWatch:
         expected = torque - self._quick[2] + self._quick[0] + self._quick[1]
         return position.tolist(), np.where(self._judged, expected, torque).tolist()
 
+    @property
+    def seen(self) -> float:
+        """Share of all cycles so far that were compared: late ones, and some after them, are not."""
+        return self._compared / max(self._taken, 1)
+
     def learned(self) -> Learned:
         """Return what was seen so far."""
         along, square, whole = self._lateness
         explains = along**2 > EXPLAINS * square * whole
         late = np.where(explains, np.abs(along) / np.maximum(square, TINY), 0.0)
-        return Learned(self._still.copy(), self._share.copy(), late)
+        return Learned(self._still.copy(), self._share.copy(), late, self.seen)
 
     def take(
         self,
@@ -172,6 +185,7 @@ class IdentityWatch:
         fresh: bool,
     ) -> list[tuple[int, str]]:
         """Take one SYNC of all axes; return those whose torque is not theirs, with a sentence each."""
+        self._taken += 1
         if not fresh:
             self.begin()
             self._blind = round(BLIND_AGAIN / self._step)
@@ -224,6 +238,7 @@ class IdentityWatch:
             # what enabling did to the torque, as at the first sample, is not theirs to explain
             self._quick[2] = expected
             return []
+        self._compared += 1
         self._over = [*self._over[1 - OF :], difference / allowed]
         self._far = [*self._far[1 - OF :], difference]
         if len(self._over) < SEEN:

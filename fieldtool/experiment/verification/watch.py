@@ -74,8 +74,11 @@ class TrialWatch:
         if guards.identity is not None:
             found += guards.identity.take(position, torque, target, offset, fresh=fresh)
             seen = guards.identity.cleaned
-        if guards.work is not None and self._small and seen is not None:
-            found += guards.work.take(*seen, fresh=fresh)
+        if guards.work is not None and self._small:
+            if seen is not None:
+                found += guards.work.take(*seen, fresh=fresh)
+            elif not fresh:  # what it did meanwhile nobody saw
+                guards.work.take(position, torque, fresh=False)
         if not found:
             return None
         k, text = found[0]

@@ -53,7 +53,7 @@ class WorkRecord:
     ) -> list[tuple[int, str]]:
         """Take one SYNC of all axes; nothing is said of it."""
         if not fresh or not self._parts:
-            self.begin()
+            self.begin(moves=bool(self._parts) and self._parts[-1][0])
         if fresh:
             self._parts[-1][1].append((position, torque))
         return []
