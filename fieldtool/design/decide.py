@@ -154,8 +154,14 @@ def _at(task: Task) -> _Result:
         As :func:`design`.
     """
     task.advance("round, check and predict", 0.95)
-    chosen, kept = no_worse(task, *held(task))
-    prediction, softer = predicted(task, chosen), task.softer
+    softer = task.softer
+    try:
+        chosen, kept = no_worse(task, *held(task))
+    except DesignError:
+        if softer is None:
+            raise
+        return _Result(task, softer.servos, predicted(task, softer.servos), _same(task, softer))
+    prediction = predicted(task, chosen)
     if softer is not None and any(
         axis.margins.bandwidth < NARROWER * width
         for axis, width in zip(prediction.axes, softer.bandwidths, strict=True)

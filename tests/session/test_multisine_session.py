@@ -181,21 +181,33 @@ def test_a_stop_in_the_middle_keeps_the_data_and_disables_the_drives(turntable, 
 
 
 def test_a_loop_that_becomes_unstable_is_named_and_the_data_are_kept(turntable):
-    kept, raised = [], False
+    """The limit of its torque may stop it before it is known from noise, in one of ten."""
+    fault = GainsRise(TABLE, FACTOR)
+    for attempt in range(4):
+        kept, raised = [], False
 
-    def told(progress):
-        nonlocal raised
-        if progress.experiment == 2 and progress.period == 2 and not raised:
-            raised = True
-            turntable.inject(GainsRise(TABLE, FACTOR))
+        def told(progress):
+            nonlocal raised
+            if progress.experiment == 2 and progress.period == 2 and not raised:
+                raised = True
+                turntable.inject(fault)
 
-    with turntable.connected() as group, group.without_feed_forward():
-        setting = setting_of(turntable, group)
-        plan = multisines(setting, seed_now(), share=0.03, periods=4)
-        with pytest.raises(LoopUnstableError, match="Lower the drive's gains") as error:
-            run_multisine(group, plan, axes_of(group, setting), kept.append, told)
-    assert turntable.powered() == {}
-    assert [(e.name, e.complete) for e in kept] == [("multisine 1", True), ("multisine 2", False)]
+        with turntable.connected() as group, group.without_feed_forward():
+            setting = setting_of(turntable, group)
+            plan = multisines(setting, seed_now() + attempt, share=0.03, periods=4)
+            with pytest.raises((SafetyStopError, LoopUnstableError)) as error:
+                run_multisine(group, plan, axes_of(group, setting), kept.append, told)
+        assert turntable.powered() == {}
+        assert [(e.name, e.complete) for e in kept] == [
+            ("multisine 1", True),
+            ("multisine 2", False),
+        ]
+        if isinstance(error.value, LoopUnstableError):
+            break
+        assert "is above the limit" in str(error.value)
+        turntable.machine.lift(fault)
+    assert isinstance(error.value, LoopUnstableError)
+    assert "Lower the drive's gains" in str(error.value)
     assert error.value.frequency == pytest.approx(growing_mode(setting, FACTOR), rel=0.25)
 
 

@@ -22,7 +22,7 @@ from fieldtool.workflow.design_inputs import drive_sides, moves_of, timing_of
 from fieldtool.workflow.designing import redesign
 from fieldtool.workflow.models import truth_model
 from fieldtool.workflow.preparation import recording_header
-from fieldtool.workflow.session import _resolved
+from fieldtool.workflow.session import resolved
 from tests.faces import machine_of, simulated
 
 
@@ -30,7 +30,7 @@ def session(tmp_path: Path, kinds: tuple[str, str], backup: bool = True) -> Sess
     """A session folder as a run leaves it: profile, backup, model."""
     folder = SessionFolder.create(tmp_path / "session")
     machine = machine_of(kinds, tmp_path)
-    write_yaml(folder.machine, _resolved(machine))
+    write_yaml(folder.machine, resolved(machine))
     model = truth_model(machine)
     assert model is not None
     write_model(model, folder.model)
