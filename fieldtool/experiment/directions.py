@@ -133,14 +133,18 @@ def _prove(motion: Motion, axes: Axes, start: FloatArray, keep: Keep) -> tuple[b
     allowed = _astray(axes) + CHECK_COUNTS * axes.counts
     quiet = np.maximum(PROOF_SHOWN * axes.counts, PROOF_QUIET * allowed)
     proven, ways = [], np.zeros(len(axes.names))
+    units = np.array([axes.unit(k) for k in range(ways.size)])
     for k, name in enumerate(axes.names):
 
         def judge(position: FloatArray, way: float, k: int = k) -> None:
             ways[k] = max(ways[k], way)
             for j, other in enumerate(axes.names):
-                most = float(allowed[j]) + PUSHED_WAY * float(ways[j])
-                if j != k:  # the pulses of another shake it
-                    most = max(most, CHECK_PUSHED * float(allowed[j]))
+                most = float(allowed[j]) + PUSHED_WAY * float(ways[units == units[j]].max())
+                if (
+                    j != k
+                ):  # another's pulses may shake it as far as another's move, or its own pulses
+                    own = float(allowed[j]) + PUSHED_WAY * float(ways[j])
+                    most = min(most, max(CHECK_PUSHED * float(allowed[j]), own))
                 _DirectionCheck.stay(other, float(position[j] - start[j]), 0.0, most, axes.unit(j))
 
         proof = Proof(axes, k, start, motion.cycle_time, quiet, judge)
