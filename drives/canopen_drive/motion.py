@@ -340,9 +340,8 @@ class CanopenMotion:
     def _without_quick_stop(self, cause: BaseException | None) -> frozenset[str]:
         """Return the axes whose power is cut at once: a quick stop needs loops that can be trusted."""
         if cause is not None and self._watch is not None and not self._watch.trusts_loops:
-            return frozenset(
-                c.drive.axis for c in self._channels
-            )  # a person's stop is no proof of them
+            # nor does a person's stop prove that they can be trusted
+            return frozenset(c.drive.axis for c in self._channels)
         return cause.power_off if isinstance(cause, SafetyStopError) else frozenset()
 
     def _make_sure_off(self) -> None:

@@ -16,6 +16,7 @@ from fieldtool.criticise.criticism import (
     SignalError,
     Verdict,
 )
+from fieldtool.criticise.effects import LIBRARY
 from fieldtool.criticise.effects.base import Context, Effect
 from fieldtool.criticise.evidence.position import position_error
 from fieldtool.criticise.evidence.spans import Spans
@@ -48,10 +49,6 @@ NEAR_NOISE = 1.5
 ENOUGH, ENOUGH_KNOWN, ENOUGH_SURE = 0.9, 0.97, 0.98
 """Share of the explainable error that has to be explained for "explained": where the noise is not known,
 where it is, and where it is and the causes' forms are no approximations."""
-SURE_FORMS = (
-    "viscous_friction", "gravity", "torque_scale", "torque_lag", "measurement_delay", "extra_mode",
-    "coupling_spring", "coupling_inertia",
-)  # fmt: skip
 FALSE_ZERO = 3.0
 """Standard errors of a torque's zero, from which a constant torque is told beside causes."""
 OTHER_UNIT = 5.0
@@ -363,22 +360,18 @@ def _verdict(causes: Sequence[Cause], held: HeldOut, zeros: Mapping[str, str]) -
     if not causes:
         return "unexplained" if left else "adequate"
     # Beside a cause that has a name even little counts: it may be of another cause than of that one.
-    of_axis = {n: [c for c in causes if n in _axes(c)] for n in names}
+    of_axis = {n: [c for c in causes if n in c.axes] for n in names}
     left |= {
         n
         for n, noise in held.noise_floor.items()
         if noise is not None and held.error_after[n].torque > NEAR_NOISE * noise and of_axis[n]
     }
     for n in left:
-        sure = all(c.effect in SURE_FORMS for c in of_axis[n])
+        sure = all(LIBRARY[c.effect].exact for c in of_axis[n])
         enough = ENOUGH if held.noise_floor[n] is None else ENOUGH_SURE if sure else ENOUGH_KNOWN
         if held.explained[n] < enough:
             return "partly explained"
     return "partly explained" if any(of_axis[n] for n in zeros) else "explained"
-
-
-def _axes(cause: Cause) -> tuple[str, ...]:
-    return (cause.axis,) if isinstance(cause.axis, str) else cause.axis
 
 
 def _notes(recording: Recording, found: Found) -> tuple[str, ...]:

@@ -52,9 +52,14 @@ class Cause:
     ties: tuple[Rival, ...] = ()
 
     @property
+    def axes(self) -> tuple[str, ...]:
+        """The axis, or both."""
+        return (self.axis,) if isinstance(self.axis, str) else self.axis
+
+    @property
     def axis_words(self) -> str:
         """The axis, or both."""
-        return self.axis if isinstance(self.axis, str) else " - ".join(self.axis)
+        return " - ".join(self.axes)
 
 
 @dataclass(frozen=True)

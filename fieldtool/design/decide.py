@@ -160,21 +160,22 @@ def _at(task: Task) -> _Result:
     except DesignError:
         if softer is None:
             raise
-        return _Result(task, softer.servos, predicted(task, softer.servos), _same(task, softer))
+        return _as_soft(task, softer)
     prediction = predicted(task, chosen)
     if softer is not None and any(
         axis.margins.bandwidth < NARROWER * width
         for axis, width in zip(prediction.axes, softer.bandwidths, strict=True)
     ):
-        return _Result(task, softer.servos, predicted(task, softer.servos), _same(task, softer))
+        return _as_soft(task, softer)
     return _Result(task, chosen, prediction, kept)
 
 
-def _same(task: Task, softer: Softer) -> frozenset[int]:
-    """Return the axes of a softer response that keep their present parameters."""
+def _as_soft(task: Task, softer: Softer) -> _Result:
+    """Return what a softer response came to, with the axes that keep their present parameters."""
     present = task.present or ()
     pairs = enumerate(zip(softer.servos, present, strict=False))
-    return frozenset(k for k, (one, now) in pairs if one == now)
+    same = frozenset(k for k, (one, now) in pairs if one == now)
+    return _Result(task, softer.servos, predicted(task, softer.servos), same)
 
 
 def _tuning(result: _Result, response: str) -> Tuning:

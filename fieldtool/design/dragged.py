@@ -18,8 +18,8 @@ import numpy as np
 from numba import njit
 from scipy.linalg import expm
 
-from fieldtool.design.loops import state_space
-from fieldtool.design.machine import Machine
+from fieldtool.design.loops import ComplexArray, state_space
+from fieldtool.design.machine import Machine, Response
 from fieldtool.design.servo import Servo
 from fieldtool.records.model import FloatArray
 
@@ -35,6 +35,30 @@ class Dragged:
     motor: FloatArray
     load: FloatArray
     torque: FloatArray
+
+
+def rubbing(
+    machine: Machine, response: Response, motors: ComplexArray, torques: ComplexArray
+) -> ComplexArray:
+    """Return the positions of the D masses with dry friction, (F, D).
+
+    Parameters
+    ----------
+    machine
+        With friction on D masses, each a motor or a last mass.
+    response
+        Of the machine to torques, at F frequencies.
+    motors, torques
+        Positions of all motors, torques of all drives, (F, M).
+    """
+    loads = np.einsum("fjk,fk->fj", response.loads, torques)
+    columns = [
+        motors[:, np.flatnonzero(machine.motors == dry.place)[0]]
+        if dry.place in machine.motors
+        else loads[:, np.flatnonzero(machine.loads == dry.place)[0]]
+        for dry in machine.dry
+    ]
+    return np.stack(columns, axis=-1)
 
 
 def dragged(

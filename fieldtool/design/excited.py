@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fieldtool.design.dragged import dragged
+from fieldtool.design.dragged import dragged, rubbing
 from fieldtool.design.loops import Loops
 from fieldtool.design.machine import Machine, respond
 from fieldtool.design.servo import Servo
@@ -83,22 +83,13 @@ def excited(
     for k in range(len(servos)):
         moved, pushed = loops.moved(k, drives[:, k])
         motors, torques = motors + moved, torques + pushed
-    loads = np.einsum("fjk,fk->fj", loops.response.loads, torques)
     finer = max(1, int(np.ceil(sent.step / LONGEST_STEP - 1e-9)))
     position = sent.signals(motors[:, [axis]])[:, 0]
     torque = sent.signals(torques[:, [axis]])[:, 0]
     if not machine.dry:
         return position, torque
-    rubbing = np.stack(
-        [
-            motors[:, int(np.flatnonzero(machine.motors == dry.place)[0])]
-            if dry.place in machine.motors
-            else loads[:, int(np.flatnonzero(machine.loads == dry.place)[0])]
-            for dry in machine.dry
-        ],
-        axis=-1,
-    )
-    speeds = np.tile(sent.signals(s[:, None] * rubbing, finer), (PERIODS, 1))
-    added = dragged(machine, servos, axis, sent.step / finer, speeds)
+    speeds = s[:, None] * rubbing(machine, loops.response, motors, torques)
+    velocities = np.tile(sent.signals(speeds, finer), (PERIODS, 1))
+    added = dragged(machine, servos, axis, sent.step / finer, velocities)
     last = slice(-sent.samples * finer, None, finer)
     return position + added.motor[last], torque + added.torque[last]

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fieldtool.design.dragged import dragged
+from fieldtool.design.dragged import dragged, rubbing
 from fieldtool.design.figures import MoveFigures, StepFigures, move_figures, step_figures
 from fieldtool.design.loops import Loops
 from fieldtool.design.machine import Machine, respond
@@ -121,16 +121,8 @@ def _dragged_ways(
     """
     loops, pushed = linear
     motors, torques = loops.moved(axis, pushed)
-    loads = np.einsum("fjk,fk->fj", loops.response.loads, torques)
-    s = 1j * wave.omega
-    speeds = []
-    for dry in machine.dry:
-        if dry.place in machine.motors:
-            one = motors[:, int(np.flatnonzero(machine.motors == dry.place)[0])]
-        else:
-            one = loads[:, int(np.flatnonzero(machine.loads == dry.place)[0])]
-        speeds.append(wave.signal(s * one))
-    out = np.column_stack(speeds)
+    rubbed = rubbing(machine, loops.response, motors, torques)
+    out = np.column_stack([wave.signal(1j * wave.omega * one) for one in rubbed.T])
     step = wave.duration / wave.samples
     added = dragged(machine, servos, axis, step, np.concatenate([out, -out]))
     n = wave.samples

@@ -34,6 +34,11 @@ class Mover(Protocol):
         """Enable all axes; those in ``free`` float; torque offsets can be streamed if asked for."""
 
 
+def torque_limits(limits: Iterable[AxisLimits]) -> FloatArray:
+    """Return the limits of all torques, shape (M,), N m or N."""
+    return np.array([one.torque for one in limits])
+
+
 @dataclass(frozen=True)
 class Axes:
     """What the runner has to know of the axes."""

@@ -249,10 +249,9 @@ class _Distinguishing(FastMeasurement):
         """
         question, screen = self._question, self._session.screen
         names = self._setting.model.names
-        axes = (
-            [question.cause.axis] if isinstance(question.cause.axis, str) else question.cause.axis
+        ground = Ground(
+            self._setting, main, tuple(names.index(a) for a in question.cause.axes), self._offsets
         )
-        ground = Ground(self._setting, main, tuple(names.index(a) for a in axes), self._offsets)
         tried: list[tuple[float, Proposal]] = []
         pair = frozenset({question.cause.effect, question.cause.ties[0].effect})
         for proposal in proposals(ground, pair):

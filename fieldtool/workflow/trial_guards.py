@@ -7,7 +7,7 @@ import numpy as np
 
 from drives.canopen_drive import CanopenGroup
 from fieldtool.design.servo import Servo
-from fieldtool.experiment.axes import Axes
+from fieldtool.experiment.axes import Axes, torque_limits
 from fieldtool.experiment.verification.identity import LEAST_SEEN, IdentityWatch, Learned
 from fieldtool.experiment.verification.trial import Tried
 from fieldtool.experiment.verification.watch import Guards
@@ -61,7 +61,7 @@ class TrialGuards:
                     f"not be told from its torque: {why}. Swings, ways and torques are watched as ever."
                 )
         axes = self._axes
-        limits = np.array([one.torque for one in axes.limits])
+        limits = torque_limits(axes.limits)
         inertia = np.zeros(limits.size) if axes.inertia is None else axes.inertia
         known = old.rest, axes.counts, limits, quanta, inertia / self._step**2, axes.units
         missing = self._works.most(WorkWatch(*known))

@@ -12,6 +12,7 @@ from fieldtool.design.moves import TestMove
 from fieldtool.design.predict import Prediction, predict
 from fieldtool.design.servo import Servo, servo_from_parameters
 from fieldtool.errors import PlanRefusedError
+from fieldtool.experiment.axes import torque_limits
 from fieldtool.experiment.forecast import Setting
 from fieldtool.experiment.multisine.design import fast_cycle_times
 from fieldtool.experiment.verification.excitation import (
@@ -177,7 +178,7 @@ def plan_trial(
             "no move can be found that keeps all limits with the old and the new parameters; nothing "
             "was moved or written. Widen the limits if the machine allows it, or use --no-verify."
         )
-    limits = np.array([one.torque for one in setting.limits])
+    limits = torque_limits(setting.limits)
     steps = [
         max(torque_steps(drive, servo, cycle) for servo in (old[k], new[k]))
         for k, drive in enumerate(group.drives)
@@ -268,7 +269,7 @@ def _with_excitation(
 ) -> TrialPlan:
     """Add the small multisine; where it can not be planned the note says why."""
     cycle = plan.trial.cycle_time
-    limits = np.array([one.torque for one in setting.limits])
+    limits = torque_limits(setting.limits)
     highest = 0.9 * HIGHEST / cycle
     peaks = [
         sorted(

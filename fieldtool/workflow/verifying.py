@@ -25,7 +25,7 @@ from fieldtool.design.servo import Servo
 from fieldtool.design.tuning import SOFTEST, Tuning, why_not_stored
 from fieldtool.design.verdict import Comparison, faults
 from fieldtool.errors import IdentificationError, OutputError
-from fieldtool.experiment.axes import Axes
+from fieldtool.experiment.axes import Axes, torque_limits
 from fieldtool.experiment.verification.oscillation import HOLD_LEVEL, LOUDEST
 from fieldtool.experiment.verification.trial import Tried, run_trial
 from fieldtool.records.model import FloatArray, MachineModel
@@ -239,7 +239,7 @@ class Verification:
 
     def _louder(self, servos: Sequence[Servo]) -> FloatArray:
         """Return times the usual level by which torques may swing at rest: what encoders' steps do."""
-        limits = np.array([one.torque for one in self._axes.limits])
+        limits = torque_limits(self._axes.limits)
         pairs = zip(self._group.drives, servos, strict=True)
         swings = np.array([encoder_swing(drive, servo) for drive, servo in pairs])
         if self._old is not None:

@@ -56,6 +56,8 @@ class Effect:
 
     spreads: ClassVar[bool] = False
     """Whether couplings pass on what is unknown of it to all axes."""
+    exact: ClassVar[bool] = False
+    """Whether its form is no approximation of what machines have."""
 
     axis: int
     parameters: tuple[Parameter, ...]

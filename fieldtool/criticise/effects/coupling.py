@@ -13,6 +13,7 @@ class CouplingSpring(Effect):
     """A spring between the last masses of two axes."""
 
     name = "coupling_spring"
+    exact = True
     equation = "tau_a = stiffness (q_a - q_b)"
     source = "linear elasticity between two bodies; Hovland, Berglund, Hanssen (chains of masses)"
     signature = "torque of one axis that goes with the other's position, strongest at low frequency"
@@ -30,6 +31,7 @@ class CouplingInertia(Effect):
     """A common inertia of the last masses of two axes, or of the motors."""
 
     name = "coupling_inertia"
+    exact = True
     equation = "tau_a = inertia q_b''"
     source = "Hovland, Berglund, Hanssen, equation 10 (off-diagonal masses)"
     signature = "torque of one axis that goes with the other's acceleration"

@@ -26,6 +26,7 @@ class ViscousFriction(Effect):
     """A torque in proportion to the velocity of the first or last mass."""
 
     name = "viscous_friction"
+    exact = True
     equation = "tau = coefficient v"
     source = "Newton's law of viscosity; Armstrong-Helouvry et al., Automatica 30, 1994"
     signature = "torque in phase with the velocity, linear, at all speeds"

@@ -24,6 +24,7 @@ class Gravity(Effect):
     """An unbalanced weight on a rotary axis."""
 
     name = "gravity"
+    exact = True
     equation = "tau = sine sin(q) + cosine cos(q)"
     source = "the torque of a weight on an arm; Khalil and Dombre, Modeling of Robots, 2002"
     signature = "torque that goes with the position, once a turn, at any speed"

@@ -152,6 +152,7 @@ class ExtraMode(Effect):
     """A further mass on a spring, at the motor or at the last mass, that the chain does not have."""
 
     name = "extra_mode"
+    exact = True
     equation = "m q'' + c (q' - x') + k (q - x) = 0, k = m (2 pi frequency)^2"
     source = "Ormondroyd and Den Hartog 1928 (vibration absorber)"
     signature = "an antiresonance and a resonance close together at one frequency; linear"

@@ -30,6 +30,7 @@ class TorqueScale(Effect):
     """A torque that is reported larger or smaller than it is."""
 
     name = "torque_scale"
+    exact = True
     equation = "reported = true / scale"
     source = "torque constant of the motor; Krause, Analysis of Electric Machinery, 2002"
     signature = "all of an axis' masses, springs and dampers off by one factor, its neighbours' not"
@@ -44,6 +45,7 @@ class TorqueLag(Effect):
     """A torque that follows what the drive reports only after a first-order lag."""
 
     name = "torque_lag"
+    exact = True
     equation = "true + time true' = reported"
     source = "current loop as a first-order lag; Leonhard, Control of Electrical Drives, 2001"
     signature = "phase that falls and a gain that falls with the frequency; linear"
@@ -71,6 +73,7 @@ class MeasurementDelay(Effect):
     """A position that is measured later than the torque of the same row."""
 
     name = "measurement_delay"
+    exact = True
     equation = "measured(t) = q(t - delay)"
     source = "sampling and transmission; Franklin, Powell, Workman, Digital Control, 1998"
     signature = "a phase in proportion to the frequency, with a gain of one; linear"

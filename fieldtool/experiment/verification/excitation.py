@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fieldtool.errors import PlanRefusedError
+from fieldtool.experiment.axes import torque_limits
 from fieldtool.experiment.forecast import Setting
 from fieldtool.experiment.multisine.excitation import signals
 from fieldtool.experiment.multisine.forecast import (
@@ -117,7 +118,7 @@ def expected_peaks(plan: MultisinePlan, setting: Setting) -> FloatArray:
 
 def _scaled(plan: MultisinePlan, setting: Setting) -> MultisinePlan:
     scaled = scaled_to_limits(plan, setting, SHARE)
-    limits = np.array([one.torque for one in setting.limits])
+    limits = torque_limits(setting.limits)
     used = float((_steady_torque(scaled, setting) / (SHARE * limits)).max())
     return scaled.scaled(1 / used) if used > 1 else scaled
 

@@ -27,6 +27,7 @@ from math import isfinite
 import numpy as np
 
 from drives.api import Alarm, AxisLimits, FloatArray
+from fieldtool.experiment.axes import torque_limits
 from fieldtool.experiment.verification.hiss import hiss
 from fieldtool.experiment.verification.swings import Swings
 
@@ -135,7 +136,7 @@ class OscillationWatch:
     ) -> None:
         self._names, self._step, self._still = tuple(names), step, still
         self._units = [(unit, TORQUE_UNITS.get(unit, "")) for unit in units or [""] * len(names)]
-        self._torque_limits = np.array([one.torque for one in limits])
+        self._torque_limits = torque_limits(limits)
         errors = np.array([one.following_error for one in limits])
         self._position_swing = SWING_OF_ERROR * errors + SWING_COUNTS * counts
         self._louder = np.ones(len(self._names)) if louder is None else louder

@@ -8,7 +8,7 @@ import numpy as np
 
 from drives.api import Capture, FloatArray, Motion
 from drives.errors import StoppedError
-from fieldtool.experiment.axes import Axes, sample_times
+from fieldtool.experiment.axes import Axes, sample_times, torque_limits
 from fieldtool.experiment.directions import CHECK_PUSHED
 from fieldtool.experiment.stepped.plan import smooth_move
 from fieldtool.experiment.verification.oscillation import LONGEST_HALF
@@ -101,7 +101,7 @@ class Steps:
 
     @property
     def _gentle_torque(self) -> FloatArray:
-        return NUDGE_TORQUE * np.array([one.torque for one in self._axes.limits])
+        return NUDGE_TORQUE * torque_limits(self._axes.limits)
 
     def nudge(self, move: TrialMove) -> None:
         """Go a little way and back; the axis has to go there, and no other may move."""
