@@ -1,4 +1,4 @@
-"""Seeds that vary from run to run and are printed, and random machines to try."""
+"""Seeds that change with the code and are printed, and random machines to try."""
 
 import os
 import tempfile
@@ -52,6 +52,13 @@ def _random_model(
     return MachineModel(tuple(chains), tuple(couplings))
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_configure(config: pytest.Config) -> None:
+    """Draw the property tests' cases from the run's number too, unless a number of theirs is given."""
+    if config.option.hypothesis_seed is None:
+        config.option.hypothesis_seed = str(seed_of_run())
+
+
 def pytest_report_header() -> str:
     """Tell the run's number, which draws the same cases again."""
     return f"{VARIABLE}={seed_of_run()}"
@@ -73,5 +80,5 @@ def random_model() -> RandomModel:
 
 @pytest.fixture
 def fresh_rng() -> np.random.Generator:
-    """Random numbers of a new seed each run; it is printed, and shown when a test fails."""
+    """Random numbers of a seed of its own; it is printed, and shown when a test fails."""
     return np.random.default_rng(fresh_seed())

@@ -297,21 +297,20 @@ def _bent(model, rng, filters, step, share=0.0):
 def test_a_current_loops_lag_biases_no_mass(random_model, fresh_rng):
     """Torques behind a low-pass: their share of the bends is fitted."""
     lag = Biquad.low_pass(500.0, 1.0)  # 0.64 ms at low frequencies
-    gained = []
+    wrong: list[list[float]] = [[], []]
     for _ in range(4):
         model = random_model(fresh_rng, (2, 1))
         recording = _bent(model, fresh_rng, (lag,), 0.004)
         records = WholeRecords(recording, joint_response(recording).lines, np.zeros(2))
         data = records.data(as_found(model), run_in=True)
         assert len(data.parts) == 2
-        wrong = []
-        for given in (data, replace(data, parts=())):
+        for errors, given in zip(wrong, (data, replace(data, parts=())), strict=True):
             found = refine(model, given, fit_delay=True).model
             pairs = zip(found.axes, model.axes, strict=True)
-            wrong.append(max(abs(a.total_mass / b.total_mass - 1.0) for a, b in pairs))
-        gained.append(np.log(wrong[0] / wrong[1]))
-    print(np.exp(gained))
-    assert np.mean(gained) < np.log(0.8)
+            errors += [a.total_mass / b.total_mass - 1.0 for a, b in pairs]
+    print(wrong)
+    with_parts, without = (np.linalg.norm(errors) for errors in wrong)
+    assert with_parts < 0.9 * without  # about half of it; noise leaves it below 0.77 in 20000 draws
 
 
 def test_a_share_that_nothing_is_known_of_is_found(random_model, fresh_rng):
