@@ -344,8 +344,9 @@ _FIGURES = (
     ("overshoot", "overshoot", ""),
     ("vibration after", "vibration", ""),
     ("following error", "following_error", ""),
-    ("sensitivity peak", "sensitivity_peak", None),
+    ("sensitivity peak", "sensitivity_peak", ""),
 )
+"""Title, name, unit that stands with each number: ``at once`` has none."""
 
 
 def verification_table(axes: Sequence[Comparison]) -> Sheet:
@@ -359,9 +360,9 @@ def verification_table(axes: Sequence[Comparison]) -> Sheet:
                 if figures is None or (value := getattr(figures, name)) is None
                 else AT_ONCE
                 if name == "settling_time" and value == 0
-                else f"{value:.3g}"
+                else f"{value:.3g} {unit}".rstrip()
                 for figures in (one.before, one.predicted, one.after)
             ]
-            shown = {"s": "s", "": one.unit, None: ""}[unit]
-            table.add(one.axis, title, *cells, shown)
+            has_none = unit or name == "sensitivity_peak"
+            table.add(one.axis, title, *cells, "" if has_none else one.unit)
     return table

@@ -115,9 +115,8 @@ def design(
             if name == response:
                 raise
             continue  # what is softer may ask for too much
-        softer = Softer(
-            result.servos, tuple(axis.margins.bandwidth for axis in result.prediction.axes)
-        )
+        widths = tuple(axis.margins.bandwidth for axis in result.prediction.axes)
+        softer = Softer(result.servos, widths, result.instead or name)
     return _tuning(result, response)
 
 
@@ -143,6 +142,8 @@ class _Result:
     prediction: Prediction
     kept: frozenset[int]
     """Axes whose present parameters are kept."""
+    instead: str = ""
+    """Softer response whose parameters these are, for nothing better keeps the margin; empty: none."""
 
 
 def _at(task: Task) -> _Result:
@@ -175,13 +176,18 @@ def _as_soft(task: Task, softer: Softer) -> _Result:
     present = task.present or ()
     pairs = enumerate(zip(softer.servos, present, strict=False))
     same = frozenset(k for k, (one, now) in pairs if one == now)
-    return _Result(task, softer.servos, predicted(task, softer.servos), same)
+    return _Result(task, softer.servos, predicted(task, softer.servos), same, softer.name)
 
 
 def _tuning(result: _Result, response: str) -> Tuning:
     task, servos, prediction, kept = result.task, result.servos, result.prediction, result.kept
     axes = []
     notes = list(notes_of(task.model, servos))
+    if result.instead:
+        notes.append(
+            f"A {response} response that is nowhere slower can not be had within its margin on all "
+            f"machines that the model allows: these are the {result.instead} one's parameters."
+        )
     for k, (side, servo, axis) in enumerate(zip(task.sides, servos, prediction.axes, strict=True)):
         parameters = side.held(as_parameters(servo, side))
         if k in kept and side.present:
@@ -268,7 +274,8 @@ def _shaping(task: Task, servos: tuple[Servo, ...], prediction: Prediction) -> l
         likely = [one for one in found if one is not None]
         if found[0] is not None:
             frequencies_ = np.array([f for f, _ in likely])
-            out.append(best_shaper(axis.axis, frequencies_, found[0][1], move.acceleration))
+            unit = "m" if task.model.axes[k].kind == "linear" else "rad"
+            out.append(best_shaper(axis.axis, frequencies_, found[0][1], move.acceleration, unit))
     return out
 
 

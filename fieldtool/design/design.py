@@ -73,6 +73,8 @@ class Softer:
     servos: tuple[Servo, ...]
     bandwidths: tuple[float, ...]
     """Hz, of the model's machine."""
+    name: str
+    """Of the response."""
 
 
 @dataclass(eq=False)

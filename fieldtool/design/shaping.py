@@ -39,6 +39,8 @@ class Shaping:
     jerk: float
     """Alternative: a jerk of the typical move's acceleration over one period of the vibration, which
     leaves little of it, rad/s3 or m/s3."""
+    unit: str = "rad"
+    """Of positions of the axis."""
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values."""
@@ -54,7 +56,7 @@ class Shaping:
         return (
             f"{self.axis}: {self.frequency:.3g} Hz is left to swing (damping ratio {self.damping:.2g}); "
             f"where moves are to end without it, shape the references with {self.shaper} ({pairs}), or "
-            f"keep the jerk below {self.jerk:.3g}."
+            f"keep the jerk below {self.jerk:.3g} {self.unit}/s3."
         )
 
 
@@ -103,7 +105,9 @@ def vibration_left(
     return float(np.hypot((grown * np.cos(phase)).sum(), (grown * np.sin(phase)).sum()))
 
 
-def best_shaper(axis: str, frequencies: FloatArray, damping: float, acceleration: float) -> Shaping:
+def best_shaper(
+    axis: str, frequencies: FloatArray, damping: float, acceleration: float, unit: str = "rad"
+) -> Shaping:
     """Return the shortest shaper that leaves little vibration at all of some frequencies.
 
     Parameters
@@ -116,6 +120,8 @@ def best_shaper(axis: str, frequencies: FloatArray, damping: float, acceleration
         Damping ratio.
     acceleration
         Of the axis' typical move.
+    unit
+        Of positions of the axis: rad or m.
     """
     frequency = float(frequencies[0])
     tried = []
@@ -124,7 +130,7 @@ def best_shaper(axis: str, frequencies: FloatArray, damping: float, acceleration
         left = max(vibration_left(a, t, float(f), damping) for f in frequencies)
         tried.append(
             Shaping(axis, frequency, damping, name, tuple(a.tolist()), tuple(t.tolist()), left,
-                    acceleration * frequency)
+                    acceleration * frequency, unit)
         )  # fmt: skip
     good = [one for one in tried if one.left <= TOLERANCE * 1.01]
     return good[0] if good else min(tried, key=lambda one: one.left)

@@ -68,6 +68,7 @@ class _Shaping(StrictModel):
     times: list[Number]
     left: Number
     jerk: Number
+    unit: Literal["rad", "m"] = "rad"
 
 
 class _TuningFile(StrictModel):

@@ -13,7 +13,7 @@ from fieldtool.report.words import AT_ONCE
 COLOURS = {"before": "#9aa5b1", "predicted": "#d1495b", "after": "#1f3b73"}
 TORQUES = {"rad": "N m", "m": "N"}
 FIGURES = (
-    ("settles after the move in", "settling_time", "s"),
+    ("settles after the move in", "settling_time", ""),
     ("overshoot", "overshoot", "position"),
     ("vibration after the move", "vibration", "position"),
     ("following error", "following_error", "position"),
@@ -57,7 +57,9 @@ def _cell(axis: Mapping[str, Any], when: str, name: str) -> str:
     value = figures.get(name) if figures else None
     if value is None:
         return ""
-    return AT_ONCE if name == "settling_time" and value == 0 else f"{value:.3g}"
+    if name == "settling_time":
+        return AT_ONCE if value == 0 else f"{value:.3g} s"
+    return f"{value:.3g}"
 
 
 def _unit(position: str, unit: str) -> str:

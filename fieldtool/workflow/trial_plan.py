@@ -25,6 +25,7 @@ from fieldtool.experiment.verification.trial import Trial
 from fieldtool.records.closed_loop import AxisLoop
 from fieldtool.records.model import FloatArray
 from fieldtool.workflow.design_inputs import moves_of, timing_of
+from fieldtool.workflow.trial_checks import check_a_count, check_as_designed, check_stable
 from fieldtool.workflow.trial_loops import answer_torque, drive_loop, first_answer
 from fieldtool.workflow.trial_moves import MOST, free_move, takes_too_much, trial_move
 
@@ -37,8 +38,6 @@ NOISE_SWINGS = 12.0
 ROUNDED_TARGETS = 3.5
 """Targets are whole counts: their second difference, a cycle squared apart, may swing by so many counts,
 peak to peak, and the inertia that is fed forward makes torque of it."""
-NOT_AS_SAID, FASTER_THAN_SAID = 1.25, 1.25
-"""Factors by which a peak of sensitivity, and a bandwidth, may be off what the tuning says."""
 STANDSTILL_TIME, STANDSTILL_TIMEOUT = 0.25, 120.0
 STANDSTILL_COUNTS, STANDSTILL_TRAVEL = 3.0, 2e-4
 """A disabled axis stands that moves by less than so many counts, or this share of its travel, in so many
@@ -62,6 +61,8 @@ class TrialPlan:
     before: Prediction
     after: Prediction
     notes: tuple[str, ...]
+    bare: tuple[Servo, ...] = ()
+    """The new ones as an excitation by references meets them: without what can be switched off."""
 
 
 def wait_for_standstill(group: CanopenGroup) -> None:
@@ -153,12 +154,14 @@ def plan_trial(
     cycle = fast_cycle_times(setting.model, group.shortest_cycle)[0]
     old = tuple(servo_of(drive, (), cycle) for drive in group.drives)
     new = tuple(servo_of(drive, changes, cycle) for drive in group.drives)
+    for k, drive in enumerate(group.drives):
+        check_a_count(drive, (old[k], new[k]), setting.limits[k].torque, cycle)
     typical = moves_of(group.machine, setting.model)
     moves = tuple(free_move(*pair) for pair in zip(group.drives, typical, strict=True))
     for _ in range(TIMES):
         before, after = (predict(setting.model, servos, moves) for servos in (old, new))
-        _check_stable(after, bound)
-        _check_as_designed(after, stated, designed)
+        check_stable(after, bound)
+        check_as_designed(after, stated, designed)
         over = [takes_too_much(setting, k, (before, after)) for k in range(len(moves))]
         if not any(over):
             break
@@ -217,43 +220,6 @@ def _answer(
     return answer, answer_torque(loops, answer, cycle)
 
 
-def _check_as_designed(
-    after: Prediction, stated: Mapping[str, float], designed: Prediction | None
-) -> None:
-    """Refuse parameters that are not what their tuning says of them: changed, or of another model."""
-    promises = {} if designed is None else {a.axis: a.margins.bandwidth for a in designed.axes}
-    for axis in after.axes:
-        peak, said = axis.margins.sensitivity_peak, stated.get(axis.axis)
-        wrong = ""
-        if said is not None and not 1 / NOT_AS_SAID < peak / said < NOT_AS_SAID:
-            wrong = f"the peak of sensitivity is {said:.3g}; now it would be {peak:.3g}"
-        elif said is not None and 0 < (promised := promises.get(axis.axis, 0.0)) < np.inf:
-            bandwidth = axis.margins.bandwidth
-            if not 1 / FASTER_THAN_SAID < bandwidth / promised < FASTER_THAN_SAID:
-                wrong = f"the bandwidth is {promised:.3g} Hz; now it would be {bandwidth:.3g} Hz"
-        if wrong:
-            raise PlanRefusedError(
-                f"{axis.axis}: its tuning says that {wrong}, by the model. Either they were changed, or "
-                "the model was. Nothing was moved or written. Design anew (`fieldtool design`)."
-            )
-
-
-def _check_stable(after: Prediction, bound: float) -> None:
-    if not after.stable:
-        raise PlanRefusedError(
-            "with the new parameters the machine would not be stable by its model. Nothing was moved "
-            "or written. Design anew (`fieldtool design`), or measure again if the machine was changed."
-        )
-    for axis in after.axes:
-        peak = axis.margins.sensitivity_peak
-        if peak > 1.2 * bound:
-            raise PlanRefusedError(
-                f"{axis.axis}: with the new parameters its peak of sensitivity would be {peak:.3g} at "
-                f"{axis.margins.peak_frequency:.3g} Hz by the model, {bound:.3g} is allowed. Nothing "
-                "was moved or written. Design anew (`fieldtool design`)."
-            )
-
-
 def without_feed_forward(drive: CanopenDrive, servo: Servo) -> AxisLoop:
     """Return a drive's loop with that feed-forward off that can be switched off."""
     loop, switched = servo.loop, drive.profile.feed_forward
@@ -281,10 +247,10 @@ def _with_excitation(
         for k in range(limits.size)
     ]
     at = np.array([drive.read_position() for drive in group.drives])
-    here = [
-        replace(setting, loops=tuple(map(without_feed_forward, group.drives, servos)), centre=at)
-        for servos in (plan.old, plan.new)
+    loops = [
+        tuple(map(without_feed_forward, group.drives, servos)) for servos in (plan.old, plan.new)
     ]
+    here = [replace(setting, loops=own, centre=at) for own in loops]
     try:
         excitation, lines = sensitivity_plan(here, peaks, group.torque_offsets, cycle)
         done = np.max([expected_peaks(excitation, one) for one in here], axis=0)
@@ -297,4 +263,5 @@ def _with_excitation(
         excursion=EXCITED * done[0],
         torque=np.minimum(EXCITED * done[3] + 0.05 * limits + 3 * np.array(steps), MOST * limits),
     )
-    return replace(plan, trial=trial, lines=lines)
+    bare = tuple(replace(s, loop=own) for s, own in zip(plan.new, loops[1], strict=True))
+    return replace(plan, trial=trial, lines=lines, bare=bare)

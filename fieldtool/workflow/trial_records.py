@@ -1,7 +1,7 @@
 """What the records of a trial come to: each axis before, as predicted, and after, on one scale."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -129,11 +129,7 @@ class TrialRecords:
             raise AssertionError("lines are those of an excitation")
         one, own = excitation.experiments[0], lines.axis == k
         sent = Periodic(lines.number, lines.samples, one.cycle_time, one.reference, one.torque)
-        servos = self.plan.new
-        if not np.all(lines.by_torque):  # as the trial does it
-            servos = tuple(
-                replace(s, loop=replace(s.loop, velocity_ff=0.0, inertia_ff=0.0)) for s in servos
-            )
+        servos = self.plan.new if np.all(lines.by_torque) else self.plan.bare
         position, torque = excited(machine, servos, sent, k)
         offset = sent.signals(one.torque[:, [k]])[:, 0] if np.all(lines.by_torque[own]) else None
         return measured_sensitivity(

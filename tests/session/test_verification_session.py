@@ -239,6 +239,30 @@ def test_a_tuning_ten_times_too_high_never_stays(session, factor, names):
     assert session.powered() == {}
 
 
+def test_an_encoder_too_coarse_for_its_feed_forward_is_said_before_anything_moves(session):
+    write_tuning(session, {**GOOD, "table": {**GOOD["table"], "inertia_ff": 5.0}})
+    ways = Heard(session)
+    outcome = write(session)
+    assert outcome.code == 3, outcome.err
+    said = " ".join(outcome.err.split())
+    assert "table: with the new parameters one count of its encoder" in said
+    assert "Nothing was moved or written" in said
+    assert not ways.enabled
+    assert session.changed() == {}
+
+
+class Heard:
+    """Hears whether any drive is enabled."""
+
+    def __init__(self, bench):
+        self.enabled = False
+        bench.machine.listen(self)
+
+    def __call__(self, _time, cob_id, data):
+        if 0x180 < cob_id < 0x200 and len(data) == 8:
+            self.enabled = self.enabled or struct.unpack("<Hih", data)[0] & 0x6F == 0x27
+
+
 @pytest.mark.parametrize("factor", [0.5, 2.0])
 def test_a_model_wrong_by_two_is_told_by_the_machine(session, factor):
     """What it predicts is not what is measured."""

@@ -173,6 +173,20 @@ def test_another_controller_shows_in_its_first_answer_within_some_counts(what):
     assert np.abs(position[:found]).max() < 500 * COUNT
 
 
+def test_what_comes_again_and_again_for_a_sample_is_seen_and_a_single_one_is_not():
+    """Gains a hundred times too high answer each count of the encoder for a sample or two."""
+    still, told = np.zeros(400), np.zeros(400)
+    quantum = np.array([0.02])
+    learned = Learned(np.array([0.02]), np.array([0.3]), np.zeros(1))
+    for every, seen in ((11, True), (150, False)):
+        told[:] = 0.0
+        told[60::every] = told[61::every] = 5.0
+        one = IdentityWatch([drive(GOOD)], STEP, quantum, learned)
+        found = first_alarm(one, still, told, still)
+        assert (found is not None) == seen
+        assert found is None or found < 60 + 50
+
+
 def test_a_filter_that_was_not_written_shows_in_the_first_answer():
     target, hold = trial_path(GOOD)
     held = replace(GOOD, filters=(Biquad.low_pass(40.0, 0.7),))

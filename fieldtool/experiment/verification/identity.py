@@ -38,6 +38,10 @@ REMEMBERED = 0.015
 """s, time constant with which what was expected is forgotten."""
 SEEN, OF = 3, 8
 """Differences above what is allowed, of so many cycles, that are enough."""
+LASTS, LASTING, ONE = 32, 0.45, 1.5
+"""Cycles over which the RMS of differences, over what is allowed, may be LASTING: what is small but goes
+on, or comes again and again for a sample or two.  One of them counts as ONE times what is allowed at
+most: an encoder's step between samples makes such a one too."""
 TINY = 1e-300
 EXPLAINS = 0.06
 """Share of the differences' squares that being late has to explain to be believed."""
@@ -208,6 +212,7 @@ class IdentityWatch:
         self._quick = np.zeros((3, m))
         self._peak, self._slope = np.zeros(m), np.zeros((2, m))
         self._over: list[FloatArray] = []
+        self._squares: list[FloatArray] = []
         self._far: list[FloatArray] = []
         self._count = 0
 
@@ -240,13 +245,16 @@ class IdentityWatch:
             return []
         self._compared += 1
         self._over = [*self._over[1 - OF :], difference / allowed]
+        capped = np.minimum(difference / (self._scale * allowed), ONE)
+        self._squares = [*self._squares[1 - LASTS :], capped**2]
         self._far = [*self._far[1 - OF :], difference]
         if len(self._over) < SEEN:
             return []
         return self._found(allowed)
 
     def _found(self, allowed: FloatArray) -> list[tuple[int, str]]:
-        over = np.sort(np.array(self._over), axis=0)[-SEEN]
+        lasting = self._scale / LASTING * np.sqrt(np.sum(self._squares, axis=0) / LASTS)
+        over = np.maximum(np.sort(np.array(self._over), axis=0)[-SEEN], lasting)
         if self._learned is None:
             self._learn(over, np.sort(np.array(self._far), axis=0)[-SEEN])
             return []

@@ -44,7 +44,8 @@ class TrialWatch:
         """Allow no more than standing still at positions, shape (M,)."""
         self.swings.hold(at, enabling=enabling)
         if self._guards.identity is not None:
-            self._guards.identity.begin()  # references are known from the enabling on
+            if enabling:
+                self._guards.identity.begin()  # references are known from the enabling on
             self._guards.identity.stand(still=not enabling)
 
     def move(self, *, small: bool) -> None:
