@@ -132,8 +132,8 @@ class Channel:
         if self.position != self.previous:
             self.anchor, self.still = None, 0
         self._judge_jump()
-        self._judge_unseen(torque)
         cycles = 1 + self.missing + self.paused
+        self._judge_unseen(torque, cycles)
         self.allowed = ceil(self.step * cycles)
         self._judge_span(cycles)
         self.missing, self.paused = 0, 0.0
@@ -149,13 +149,13 @@ class Channel:
                 self.jumped, self.jumped_ago = change, JUMP_CYCLES
         self.step_before = step if even else None
 
-    def _judge_unseen(self, torque: int) -> None:
+    def _judge_unseen(self, torque: int, cycles: float) -> None:
         if self.unseen is None:
             return
-        if self.missing or self.paused or self.statusword & ENABLED_MASK != ENABLED_VALUE:
+        if self.statusword & ENABLED_MASK != ENABLED_VALUE:
             self.unseen.restart()
         else:
-            self.unseen.take(self.position, torque)
+            self.unseen.take(self.position, torque, cycles)
 
     def _judge_span(self, cycles: float) -> None:
         if self.span_begin is None:

@@ -9,7 +9,8 @@ Two things tell so, whatever the loop does:
   the inertia of the prior model would have been pushed away.
 
 Friction, and the mean torque of weight, are learned while the axis moves: what it stood under, and then
-moved.  All in position units, torque units and cycles.
+moved.  Cycles that are missing now and then, or late, are bridged: of what happened in them only what is
+sure counts.  All in position units, torque units and cycles.
 """
 
 from collections import deque
@@ -49,6 +50,8 @@ PULL_TIME = 0.5
 """Seconds in motion over which the mean torque is taken."""
 STOOD = 2
 """Steps without motion after which an axis stands."""
+BRIDGED_TIME, BRIDGED_CYCLES = 0.02, 3.0
+"""Seconds, or cycles, between two samples that are bridged: over longer ones it begins anew."""
 
 
 @dataclass
@@ -63,7 +66,7 @@ class Learned:
     """Mean direction of that motion, -1 to 1: its share of friction is in the mean torque."""
     cycle_time: float = 0.0
     """s, of the motion in which the next was seen."""
-    change: int = 0
+    change: float = 0.0
     """Largest change of a step from one cycle to the next."""
     samples: int = 0
     """Samples in motion so far."""
@@ -115,6 +118,7 @@ class Unseen:
         self._learned, self._push, self._floor = learned, push, floor
         self._fresh = min(1.0, cycle_time / PULL_TIME)
         self._torques = [0] * SMOOTHED
+        self._bridged = max(BRIDGED_CYCLES, BRIDGED_TIME / cycle_time)
         self._count = max(STOOD, round(HELD_TIME / cycle_time))
         self._lasting: deque[int] = deque(maxlen=self._count)
         self._long = max(STOOD, round(LEARN_TIME / cycle_time))
@@ -125,9 +129,10 @@ class Unseen:
         self.at_rest = max(LEAST_UNITS, window / WINDOW_SHARE) + SWING * wind_up
         """Position units that an axis at rest may go unseen, by its torque and inertia."""
         self._position: int | None = None
-        self._step = self._step_before = self._stood = 0
-        self._coasting = False
-        self._speed = 0.0
+        self._step = self._step_before = 0.0
+        self._stood = 0
+        self._coasting = self._doubtful = False
+        self._speed = self._pushed = 0.0
         self.way = 0.0
         """How far it has gone unseen, position units; signed."""
         self.alarm = ""
@@ -147,33 +152,42 @@ class Unseen:
         """Begin anew: time has passed unseen, or nothing pushes the axis."""
         self._position = None
 
-    def take(self, position: int, torque: int) -> None:
-        """Take the sample of the next cycle."""
+    def take(self, position: int, torque: int, cycles: float = 1.0) -> None:
+        """Take the next sample, which comes so many cycles after the one before."""
+        if cycles > self._bridged:
+            self.restart()
         before, self._position = self._position, position
-        self._torques = [torque] * SMOOTHED if before is None else [*self._torques[1:], torque]
-        self._lasting.append(torque)
         if before is None:
+            self._torques = [torque] * SMOOTHED
+            self._lasting.append(torque)
             if not self._learned.samples and not self.knows:
                 self._learned.torque = torque
-            self._step = self._step_before = 0
+            self._step = self._step_before = 0.0
             self._begin()
             self._hold_at(position)
             return
-        self._since += 1
+        for _ in range(max(1, round(cycles))):
+            self._torques = [*self._torques[1:], torque]
+            self._lasting.append(torque)
+        self._since += max(1, round(cycles))
         self._learn_friction(position)
         if position != before:
-            self._moves(position - before, torque)
+            self._moves(position - before, torque, cycles)
             self._begin()
             return
         self._stood += 1
         if self._stood == 1:
-            self._speed = self._speed_left()
+            self._speed = self._speed_left(cycles)
             self._coasting = self._speed != 0
-        self._push_on(sum(self._torques) / SMOOTHED - self._learned.pull)
+        pushed = sum(self._torques) / SMOOTHED - self._learned.pull
+        if cycles > 1:
+            self._push_on(_surely(self._pushed, pushed), cycles - 1)
+        self._push_on(pushed)
+        self._pushed = pushed
 
     def _begin(self) -> None:
         self._stood = 0
-        self._speed = self.way = 0.0
+        self._speed = self.way = self._pushed = 0.0
         self._coasting = False
 
     def _hold_at(self, position: int) -> None:
@@ -196,18 +210,30 @@ class Unseen:
             learned.note_hold(self._held)
         self._hold_at(position)
 
-    def _moves(self, step: int, torque: int) -> None:
+    def _moves(self, step: int, torque: int, cycles: float) -> None:
         learned = self._learned
         direction = 1.0 if step > 0 else -1.0
         learned.torque += self._fresh * (torque - learned.torque)
         learned.direction += self._fresh * (direction - learned.direction)
-        before = 0 if self._stood else self._step
-        entered = abs(self._step) if self._stood else 0  # that it stood so suddenly was no alarm
-        learned.change = max(learned.change, abs(step - before), entered)
-        learned.samples += 1
-        self._step_before, self._step = before, step
+        if cycles > 1:
+            self._bridge(step / cycles, cycles)
+            return
+        before = 0.0 if self._stood else self._step
+        if not self._doubtful:
+            entered = (
+                abs(self._step) if self._stood else 0
+            )  # that it stood so suddenly was no alarm
+            learned.change = max(learned.change, abs(step - before), entered)
+            learned.samples += 1
+        self._step_before, self._step, self._doubtful = before, step, False
 
-    def _speed_left(self) -> float:
+    def _bridge(self, mean: float, cycles: float) -> None:
+        """Take the mean step of some cycles: its last one may be slower, as far as is normal."""
+        slowest = max(0.0, abs(mean) - self._learned.change * (cycles - 1) / 2)
+        self._step_before, self._step = 0.0, slowest if mean > 0 else -slowest
+        self._doubtful = True
+
+    def _speed_left(self, cycles: float) -> float:
         """Return how fast it must still be, position units a cycle, whatever friction did."""
         learned, last, before = self._learned, self._step, self._step_before
         if learned.samples < LEARN:
@@ -216,26 +242,33 @@ class Unseen:
         size = max(
             sign * last - LAST_STEP * learned.change, sign * before - STEP_BEFORE * learned.change
         )
-        return sign * max(0.0, size - 1)
+        return sign * max(0.0, size - 1 - learned.change * (cycles - 1))
 
-    def _push_on(self, pushed: float) -> None:
-        """Go on by a cycle under a torque beside the mean."""
-        friction = self._learned.friction
+    def _push_on(self, pushed: float, cycles: float = 1.0) -> None:
+        """Go on by so many cycles under a torque beside the mean."""
+        friction, push = self._learned.friction, self._push * cycles
         if self._coasting:
             direction = 1.0 if self._speed > 0 else -1.0
-            self._speed += self._push * (pushed - direction * friction)
+            self._speed += push * (pushed - direction * friction)
             if direction * self._speed <= 0:
                 self._speed, self._coasting = 0.0, False
-            self.way += self._speed
+            self.way += self._speed * cycles
             if self._stood >= STOOD and abs(self.way) > self.dead:
                 self.alarm = "dead"
             return
         hold = FRICTION_SHARE * friction + self._floor
         if abs(pushed) > hold:
-            self._speed += self._push * (pushed - hold if pushed > 0 else pushed + hold)
+            self._speed += push * (pushed - hold if pushed > 0 else pushed + hold)
         else:  # it may have been caught again
-            left = max(0.0, abs(self._speed) - self._push * hold)
+            left = max(0.0, abs(self._speed) - push * hold)
             self._speed = left if self._speed > 0 else -left
-        self.way += self._speed
+        self.way += self._speed * cycles
         if self.knows and abs(self.way) > self.at_rest:
             self.alarm = "pushed"
+
+
+def _surely(before: float, now: float) -> float:
+    """Return the torque that acted between two samples at least: none where it changed its sign."""
+    if before * now <= 0:
+        return 0.0
+    return before if abs(before) < abs(now) else now
