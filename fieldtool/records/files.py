@@ -21,7 +21,7 @@ def write_atomic(path: Path | str, content: bytes | memoryview) -> None:
         If the folder is missing or not writable, or the disk is full; the sentence says which.
     """
     path = Path(path)
-    if path.is_dir():
+    if os.path.isdir(path):  # false where that can not be seen, too
         raise OutputError(f"{path} is a folder, not a file: give a file name to write to.")
     temporary: str | None = None
     try:
@@ -38,6 +38,31 @@ def write_atomic(path: Path | str, content: bytes | memoryview) -> None:
     finally:
         if temporary is not None:
             Path(temporary).unlink(missing_ok=True)
+
+
+def write_new(path: Path, text: str) -> None:
+    """Write a text file that must not be there yet; where that fails, nothing is left of it.
+
+    Raises
+    ------
+    FileExistsError
+        If it is there already; it is unchanged.
+    OutputError
+        If it can not be written.
+    """
+    try:
+        with path.open("x", encoding="utf-8") as file:
+            try:
+                file.write(text)
+                file.flush()
+                os.fsync(file.fileno())
+            except OSError:
+                path.unlink(missing_ok=True)
+                raise
+    except FileExistsError:
+        raise
+    except OSError as error:
+        raise OutputError(_reason(path, len(text), error)) from error
 
 
 def make_folder(path: Path | str) -> Path:
@@ -116,7 +141,7 @@ def _reason(path: Path, size: int, error: OSError) -> str:
             f"{path} can not be written: no room for {size / MEBIBYTE:.1f} MiB on the disk "
             f"({error.strerror}); what was there before is unchanged. Make room and try again."
         )
-    if not path.parent.is_dir():
+    if error.errno in (errno.ENOENT, errno.ENOTDIR):
         return f"{path} can not be written: there is no folder {path.parent}. Make it first."
     return (
         f"{path} can not be written ({error.strerror}): check that the folder {path.parent} "

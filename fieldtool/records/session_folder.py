@@ -27,8 +27,10 @@ class SessionFolder:
         try:
             path.mkdir(parents=True, exist_ok=True)
             probe = path / ".writable"
-            probe.write_bytes(b"x" * 4096)
-            probe.unlink()
+            try:
+                probe.write_bytes(b"x" * 4096)
+            finally:
+                probe.unlink(missing_ok=True)
         except OSError as error:
             raise OutputError(
                 f"{path}: results can not be written here ({error.strerror}). Choose another folder "
@@ -46,11 +48,15 @@ class SessionFolder:
             If there is no such folder, or nothing of a session is in it.
         """
         folder = cls(path)
-        if not path.exists():
+        try:
+            path.stat()
+        except PermissionError as error:
+            raise FileFormatError(path, f"can not be looked into ({error.strerror}).") from None
+        except OSError:
             raise FileFormatError(
                 path,
                 "does not exist. Give the folder of a session (--out of a run), or one of its files.",
-            )
+            ) from None
         if not path.is_dir():
             raise FileFormatError(path, "is a file. Give the folder of a session.")
         if (path / "recording.yaml").is_file():

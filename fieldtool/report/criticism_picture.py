@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from fieldtool.criticise.criticism import Criticism
 from fieldtool.criticise.pictures_file import Picture
-from fieldtool.errors import OutputError
+from fieldtool.report.picture_file import save_picture
 
 COLORS = {
     "measured torque": "#9aa5b1",
@@ -53,10 +53,7 @@ def draw_criticism(criticism: Criticism, pictures: Sequence[Picture], path: Path
         plot.legend(fontsize=8, loc="upper right")
     names = ", ".join(f"{c.effect} ({c.axis_words})" for c in criticism.causes)
     figure.suptitle(f"{criticism.verdict}: {names or 'no cause named'}", fontsize=11)
-    try:
-        figure.savefig(path, dpi=100)
-    except OSError as error:
-        raise OutputError(f"{path} can not be written ({error.strerror}).") from error
+    save_picture(figure, path, 100)
 
 
 def _draw(plot: Axes, picture: Picture) -> None:

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from fieldtool.design.predict import AxisPrediction
 from fieldtool.design.tuning import Tuning
 from fieldtool.errors import OutputError
+from fieldtool.report.picture_file import save_picture
 
 BEFORE, AFTER, LOAD = "#b0483a", "#1f6f8b", "#7aa95c"
 
@@ -48,10 +49,7 @@ def draw_design(tuning: Tuning, units: Mapping[str, str], path: Path) -> None:
     figure.suptitle(
         f"Designed parameters ({tuning.response or 'as read'}): predicted, before and after"
     )
-    try:
-        figure.savefig(path, dpi=110, format="png")
-    except OSError as error:
-        raise OutputError(f"{path}: can not be written ({error.strerror})") from error
+    save_picture(figure, path, 110)
 
 
 def _sensitivity(

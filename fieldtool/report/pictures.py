@@ -9,12 +9,12 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 
-from fieldtool.errors import OutputError
 from fieldtool.frf.matrix import OTHERS_FREE, SOLVED
 from fieldtool.frf.response import FrequencyResponse
 from fieldtool.identify.likelihood.model_band import relative_std
 from fieldtool.identify.likelihood.refine import RefinedModel, machine_response
 from fieldtool.records.model import FloatArray, MachineModel
+from fieldtool.report.picture_file import save_picture
 
 MEASURED, MODEL, PRIOR = "#1f3b73", "#d1495b", "#9aa5b1"
 POINTS = 2000
@@ -80,10 +80,7 @@ def draw_responses(
         plot.xaxis.set_minor_formatter(NullFormatter())
         plot.set_xlabel("frequency, Hz")
     plots[0, 0].legend(loc="upper left", fontsize=8, frameon=False)
-    try:
-        figure.savefig(path, dpi=110)
-    except OSError as error:
-        raise OutputError(f"{path}: can not be written ({error.strerror}).") from error
+    save_picture(figure, path, 110)
 
 
 class _Curves:

@@ -11,8 +11,8 @@ from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 
 from fieldtool.design.predict import Prediction
 from fieldtool.design.verdict import Comparison
-from fieldtool.errors import OutputError
 from fieldtool.records.model import FloatArray
+from fieldtool.report.picture_file import save_picture
 
 BEFORE, PREDICTED, AFTER, REFERENCE = "#9aa5b1", "#d1495b", "#1f3b73", "#2b2b2b"
 History = tuple[FloatArray, ...] | None
@@ -53,10 +53,7 @@ def draw_verification(
     for plot in (plots[0, 0], plots[0, 2]):
         if plot.get_legend_handles_labels()[0]:
             plot.legend(loc="best", fontsize=8)
-    try:
-        figure.savefig(path, dpi=110)
-    except OSError as error:
-        raise OutputError(f"{path}: can not be written ({error.strerror})") from error
+    save_picture(figure, path, 110)
 
 
 def foreseen_move(prediction: Prediction, k: int) -> History:

@@ -10,6 +10,7 @@ from drives.profile.draft import draft, profile_name
 from drives.profile.eds import read_eds
 from drives.profile.match import obstacles
 from fieldtool.errors import OutputError
+from fieldtool.records.files import write_new
 
 
 @dataclass(frozen=True)
@@ -59,14 +60,11 @@ def new_profile(eds: Path, out: Path | None = None) -> CheckedProfile:
     name = profile_name(path)
     text = draft(dictionary, name, eds.name if beside else str(eds.absolute()))
     try:
-        with path.open("x", encoding="utf-8") as file:
-            file.write(text)
+        write_new(path, text)
     except FileExistsError:
         raise OutputError(
             f"{path}: is there already and is not overwritten. Give another name with -o."
         ) from None
-    except OSError as error:
-        raise OutputError(f"{path}: can not be written ({error.strerror}).") from None
     return check_profile(path)
 
 

@@ -1,13 +1,13 @@
 """A machine profile to begin with, from what was found on a bus; what nobody knows is left open."""
 
 import json
-import os
 from pathlib import Path
 
 from drives import objects
 from drives.objects import ObjectInfo
 from drives.scan import ScannedNode
 from fieldtool.errors import OutputError
+from fieldtool.records.files import write_new
 from fieldtool.workflow.scanning import ScanResult
 
 OPEN = "FILL IN"
@@ -70,14 +70,9 @@ def write_skeleton(result: ScanResult, path: Path) -> tuple[int, int]:
     name = (name if name[:1].isalpha() else f"m-{name}")[:32]
     text = skeleton(result, name)
     try:
-        with path.open("x", encoding="utf-8") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
+        write_new(path, text)
     except FileExistsError:
         raise OutputError(f"{path}: exists, and is not overwritten. Choose another file.") from None
-    except OSError as error:
-        raise OutputError(f"{path}: can not be written ({error.strerror}).") from None
     body = [line.split("#")[0] for line in text.splitlines()]
     return drives, sum(line.count(OPEN) for line in body)
 
