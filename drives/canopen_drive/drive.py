@@ -57,6 +57,8 @@ class CanopenDrive:
         line.add_node(self.node)
         self._identity: DriveIdentity | None = None
         self._scaled: Scaled | None = None
+        self.left_changed = False
+        """Whether something that was set for a time could not be put back."""
         self.learned = Learned()
         """What its motion has shown so far; learned while it moves."""
 
@@ -505,6 +507,10 @@ class CanopenDrive:
         request = struct.pack("<BHBHxx", 0x2B, objects.CONTROLWORD.address.index, 0, QUICK_STOP)
         with suppress(DrivesError):
             self.line.send_message(0x600 + self.node_id, request)
+
+    def to_pre_operational(self) -> None:
+        """Lead the node to NMT pre-operational, where its PDOs may be set up."""
+        self.node.nmt.send_command(ENTER_PRE_OPERATIONAL)
 
     def stop_node(self) -> None:
         """Send NMT stop to the node; a bus that does not take it changes nothing."""

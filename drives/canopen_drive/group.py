@@ -26,7 +26,7 @@ from drives.objects import ObjectInfo
 from drives.profile import AxisProfile, DriveProfile, MachineProfile, load_drive
 from drives.trace import traced
 
-START_NODE, ENTER_PRE_OPERATIONAL = 0x01, 0x80
+START_NODE = 0x01
 LISTENING_TIME = 0.3
 """Seconds for which the bus is listened to before anything is changed."""
 
@@ -277,6 +277,7 @@ class CanopenGroup:
     ) -> None:
         """Put the fail-safe objects back, but not while they may be all that stops a drive."""
         if drive.axis in unsure:
+            drive.left_changed = True
             self._warn(
                 f"{drive.axis}: its fail-safe objects (0x1016, 0x6007, 0x1029) were left armed, because "
                 "the drive may still be enabled. Switch the drive off and on."
@@ -293,7 +294,7 @@ class CanopenGroup:
 
     def _leave_operational(self, drive: CanopenDrive) -> None:
         try:
-            drive.node.nmt.send_command(ENTER_PRE_OPERATIONAL)
+            drive.to_pre_operational()
         except DrivesError as error:
             self._warn(f"{drive.axis}: {error}")
 

@@ -33,6 +33,9 @@ DRIVE_HEARTBEAT = 0.1
 OUTPUTS = (objects.CONTROLWORD, objects.TARGET_POSITION, objects.TARGET_TORQUE)
 OUTPUTS_WITH_OFFSET = (objects.CONTROLWORD, objects.TARGET_POSITION, TORQUE_OFFSET)
 INPUTS = (objects.STATUSWORD, objects.POSITION_ACTUAL, objects.TORQUE_ACTUAL)
+PDOS = ((0x1400, 0x1600), (0x1800, 0x1A00))
+"""Communication and mapping objects of the first PDO each way: it is mapped anew, the next three are
+switched off."""
 
 
 class TemporaryObjects:
@@ -99,6 +102,8 @@ class TemporaryObjects:
                         f"more; not put back: {', '.join(left)}. Switch the drive off and on."
                     )
                     self._before.clear()
+        if failures:
+            self._drive.left_changed = True
         return failures
 
     def _write_surely(self, info: ObjectInfo, value: float) -> None:
@@ -219,9 +224,8 @@ def process_data(
                 f"{drive.axis}, object {wanted.address} ({wanted.name}): the drive has "
                 f"{info.type}, the tool's PDOs need {wanted.type}."
             )
-    for communication, mapping, cob_id, entries in (
-        (0x1400, 0x1600, 0x200, outputs),
-        (0x1800, 0x1A00, 0x180, INPUTS),
+    for (communication, mapping), cob_id, entries in zip(
+        PDOS, (0x200, 0x180), (outputs, INPUTS), strict=True
     ):
         for other in range(3, 0, -1):
             _switch_off(drive, communication + other, changes)
@@ -229,7 +233,7 @@ def process_data(
 
 
 def _switch_off(drive: CanopenDrive, communication: int, changes: TemporaryObjects) -> None:
-    info = _cob_id(communication)
+    info = cob_id_of(communication)
     before = drive.read_optional(info)
     if before is not None and not before & PDO_OFF:
         changes.change(info, before | PDO_OFF, before)
@@ -243,41 +247,52 @@ def _map(
     entries: tuple[ObjectInfo, ...],
     changes: TemporaryObjects,
 ) -> None:
-    identifier = _cob_id(communication)
-    kind = ObjectInfo(ObjectAddress(communication, 2), "UNSIGNED8", "PDO transmission type")
-    count = ObjectInfo(ObjectAddress(mapping, 0), "UNSIGNED8", "number of mapped objects")
+    identifier, kind, count = cob_id_of(communication), kind_of(communication), count_of(mapping)
     old_identifier, old_count = drive.read_int(identifier), drive.read_int(count)
-    old_entries = [drive.read_int(_entry(mapping, k + 1)) for k in range(old_count)]
-    # Put back in reverse: off, type, count 0, entries, count, on.  CiA 301, clause 7.5.2.36.
+    old_entries = [drive.read_int(entry_of(mapping, k + 1)) for k in range(old_count)]
+    # Put back in reverse: off, identifier, type, count 0, entries, count, on.  CiA 301, clause 7.5.2.36.
     off = (old_identifier | PDO_OFF) & 0xFFFFFFFF
     changes.note(identifier, old_identifier)
     changes.note(count, old_count)
     for k in range(old_count, len(entries)):
-        unused = drive.read_optional(_entry(mapping, k + 1))
+        unused = drive.read_optional(entry_of(mapping, k + 1))
         if unused is not None:
-            changes.note(_entry(mapping, k + 1), unused, matters=False)
+            changes.note(entry_of(mapping, k + 1), unused, matters=False)
     for k, old in enumerate(old_entries):
-        changes.note(_entry(mapping, k + 1), old)
+        changes.note(entry_of(mapping, k + 1), old)
     changes.note(count, 0)
     drive.write(identifier, off)
     changes.change(kind, SYNCHRONOUS)
     changes.note(identifier, off)
+    changes.note(identifier, cob_id | PDO_OFF)  # an identifier may change only while the PDO is off
     drive.write(count, 0)
     for k, info in enumerate(entries):
         address = info.address
         value = address.index << 16 | address.subindex << 8 | type_bits(info.type)
-        drive.write(_entry(mapping, k + 1), value)
+        drive.write(entry_of(mapping, k + 1), value)
     drive.write(count, len(entries))
-    found = [drive.read_int(_entry(mapping, k + 1)) >> 8 for k in range(drive.read_int(count))]
+    found = [drive.read_int(entry_of(mapping, k + 1)) >> 8 for k in range(drive.read_int(count))]
     wanted = [info.address.index << 8 | info.address.subindex for info in entries]
     if found != wanted:
         raise SdoAbortError(drive.axis, mapping, 0, 0x06040041, "map")
     drive.write(identifier, cob_id)
 
 
-def _cob_id(communication: int) -> ObjectInfo:
+def cob_id_of(communication: int) -> ObjectInfo:
+    """Return the object with a PDO's identifier, and bit 31 that switches it off."""
     return ObjectInfo(ObjectAddress(communication, 1), "UNSIGNED32", "COB-ID of PDO")
 
 
-def _entry(mapping: int, k: int) -> ObjectInfo:
+def kind_of(communication: int) -> ObjectInfo:
+    """Return the object that says when a PDO is sent, or taken over."""
+    return ObjectInfo(ObjectAddress(communication, 2), "UNSIGNED8", "PDO transmission type")
+
+
+def count_of(mapping: int) -> ObjectInfo:
+    """Return the object that says how many objects a PDO carries."""
+    return ObjectInfo(ObjectAddress(mapping, 0), "UNSIGNED8", "number of mapped objects")
+
+
+def entry_of(mapping: int, k: int) -> ObjectInfo:
+    """Return the object that says what a PDO carries in place k, from 1."""
     return ObjectInfo(ObjectAddress(mapping, k), "UNSIGNED32", f"mapped object {k}")

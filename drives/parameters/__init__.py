@@ -28,6 +28,7 @@ from drives.parameters.journal import (
 )
 from drives.parameters.journal_file import load_journal, save_journal
 from drives.parameters.outcome import MEMORY_WORDS, DriveOutcome
+from drives.parameters.set_up import check_set_up
 from drives.parameters.store import check_can_store
 from drives.parameters.transaction import Transaction
 from drives.parameters.values import HeldObject, Raw, same
@@ -57,6 +58,7 @@ __all__ = [
     "check_disabled",
     "check_objects",
     "check_same_drives",
+    "check_set_up",
     "load_backup",
     "load_journal",
     "planned_changes",

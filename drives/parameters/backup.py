@@ -14,6 +14,7 @@ from drives.canopen_drive import CanopenDrive
 from drives.errors import ProfileError, SdoAbortError
 from drives.objects import DATA_TYPES, ObjectAddress, ObjectInfo
 from drives.parameters.durable import write_durably
+from drives.parameters.set_up import read_set_up
 from drives.parameters.values import HeldObject, checked_value
 from drives.profile import read_yaml
 
@@ -36,6 +37,8 @@ class DriveBackup:
     revision_number: int
     """0 where the drive has none, or the backup does not say."""
     held: tuple[HeldObject, ...]
+    set_up: tuple[HeldObject, ...] = ()
+    """What a motion changes besides, and puts back: brought back only where it was cut off."""
 
 
 @dataclass(frozen=True)
@@ -76,6 +79,7 @@ def back_up(machine: str, drives: Iterable[CanopenDrive]) -> Backup:
                 identity.serial_number,
                 identity.revision,
                 tuple(held),
+                read_set_up(drive),
             )
         )
     return Backup(machine, datetime.now(UTC).isoformat(timespec="seconds"), tuple(parts))
@@ -124,15 +128,17 @@ def _drive_as_dict(drive: DriveBackup) -> dict[str, Any]:
         "product_code": drive.product_code,
         "serial_number": drive.serial_number,
         "revision_number": drive.revision_number,
-        "objects": [
-            {
-                "object": str(held.info.address),
-                "name": held.info.name,
-                "type": held.info.type,
-                "value": held.value,
-            }
-            for held in drive.held
-        ],
+        "objects": [_held_as_dict(held) for held in drive.held],
+        "set_up": [_held_as_dict(held) for held in drive.set_up],
+    }
+
+
+def _held_as_dict(held: HeldObject) -> dict[str, Any]:
+    return {
+        "object": str(held.info.address),
+        "name": held.info.name,
+        "type": held.info.type,
+        "value": held.value,
     }
 
 
@@ -190,13 +196,8 @@ def listed(value: Any) -> list[Any]:
 
 def _drive_backup(drive: Mapping[str, Any], k: int, place: list[str | int]) -> DriveBackup:
     place[:] = ["drives", k]
-    held: dict[ObjectAddress, HeldObject] = {}
-    for j, item in enumerate(listed(drive["objects"])):
-        place[:] = ["drives", k, "objects", j]
-        one = _held(item)
-        if one.info.address in held:
-            raise ValueError(f"object {one.info.address} stands here a second time")
-        held[one.info.address] = one
+    held = _all_held(drive["objects"], [*place, "objects"], place)
+    set_up = _all_held(drive.get("set_up", []), ["drives", k, "set_up"], place)
     place[:] = ["drives", k]
     return DriveBackup(
         str(drive["axis"]),
@@ -205,8 +206,21 @@ def _drive_backup(drive: Mapping[str, Any], k: int, place: list[str | int]) -> D
         whole(drive["product_code"]),
         whole(drive["serial_number"]),
         whole(drive.get("revision_number", 0)),
-        tuple(held.values()),
+        held,
+        set_up,
     )
+
+
+def _all_held(items: Any, where: list[str | int], place: list[str | int]) -> tuple[HeldObject, ...]:
+    """Read a list of objects; ``place`` becomes where in the file it is at work."""
+    held: dict[ObjectAddress, HeldObject] = {}
+    for j, item in enumerate(listed(items)):
+        place[:] = [*where, j]
+        one = _held(item)
+        if one.info.address in held:
+            raise ValueError(f"object {one.info.address} stands here a second time")
+        held[one.info.address] = one
+    return tuple(held.values())
 
 
 def _held(item: Mapping[str, Any]) -> HeldObject:

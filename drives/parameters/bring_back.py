@@ -9,6 +9,7 @@ from drives.objects import DEVICE_TYPE, ObjectAddress
 from drives.parameters.access import take_over, unlock
 from drives.parameters.backup import DriveBackup
 from drives.parameters.journal import DriveRecord
+from drives.parameters.set_up import bring_set_up_back
 from drives.parameters.values import HeldObject, ParameterDrive, Raw, same
 
 PATIENCE = 10.0
@@ -87,8 +88,9 @@ def bring_back(
     backup
         Every parameter of the drive.
     whole
-        Bring the whole backup back.  It comes back too where the drive holds values of neither
-        side, as after a reboot: then it has lost more than what was written.
+        Bring the whole backup back, and what a motion had set up, where the backup holds that.  The
+        parameters come back too where the drive holds values of neither side, as after a reboot: then
+        it has lost more than what was written.
 
     Raises
     ------
@@ -99,6 +101,7 @@ def bring_back(
         raise SilentDriveError(_why_silent(drive))
     found = look(drive, record)
     unlock(drive)
+    set_up, not_set_up = bring_set_up_back(drive, backup.set_up) if whole else ((), {})
     wanted = {entry.info.address: HeldObject(entry.info, entry.before) for entry in record.entries}
     if whole or found is Found.OTHER:
         wanted = {held.info.address: held for held in backup.held} | wanted
@@ -117,7 +120,7 @@ def bring_back(
         if not (isinstance(value, _Unread) or same(held.info, value, held.value)):
             failed[held.info.address] = f"{value}, was {held.value}"
     kept = tuple(held for held in written if held.info.address not in failed)
-    return BroughtBack(found, kept, failed)
+    return BroughtBack(found, (*set_up, *kept), {**not_set_up, **failed})
 
 
 class _Unread(str):

@@ -125,6 +125,10 @@ class Transaction:
         if prove is not None:
             prove()
             for drive in self._drives.values():
+                if drive.left_changed:
+                    raise MismatchError(
+                        f"{drive.axis}: what the trial had set for its time could not be put back"
+                    )
                 self._check(drive)
 
     def _heed_stop(self) -> None:
@@ -281,10 +285,11 @@ class Transaction:
             outcome.memory = self._record(axis).memory
 
     def _bring_back(self, axis: str, *, whole: bool) -> None:
-        outcome = self.outcomes[axis]
+        outcome, drive = self.outcomes[axis], self._drives[axis]
+        whole = whole or drive.left_changed
         try:
             done: BroughtBack = bring_back(
-                self._drives[axis], self._record(axis), self._backups[axis], whole=whole
+                drive, self._record(axis), self._backups[axis], whole=whole
             )
         except SilentDriveError:
             outcome.found = Found.SILENT

@@ -24,6 +24,10 @@ class ParameterDrive(Drive, Protocol):
         """What the machine profile says of the axis."""
 
     @property
+    def left_changed(self) -> bool:
+        """Whether something that was set for a time could not be put back."""
+
+    @property
     def begins_anew(self) -> bool:
         """Whether it was switched on with this bus: nothing of an earlier session is in it."""
 
@@ -53,6 +57,9 @@ class ParameterDrive(Drive, Protocol):
 
     def restart(self, patience: float) -> bool:
         """Restart it as a power cycle would; whether it is back within so many seconds."""
+
+    def to_pre_operational(self) -> None:
+        """Lead it to NMT pre-operational."""
 
     def power_state(self) -> PowerState:
         """Power state that the drive shows."""

@@ -103,13 +103,14 @@ class MoveChecks:
             with backed_up(self._machine.name, group.drives, folder.parameters_before):
                 yield
         finally:
-            with suppress(OSError):  # what else is in it stays
-                lock = (path / JOURNAL).with_suffix(".lock")
-                for left in (folder.parameters_before, folder.machine, lock):
-                    left.unlink(missing_ok=True)
-                path.rmdir()
-                if alone:
-                    path.parent.rmdir()
+            if not (path / JOURNAL).exists():  # else something is left to be restored
+                with suppress(OSError):  # what else is in it stays
+                    lock = (path / JOURNAL).with_suffix(".lock")
+                    for left in (folder.parameters_before, folder.machine, lock):
+                        left.unlink(missing_ok=True)
+                    path.rmdir()
+                    if alone:
+                        path.parent.rmdir()
 
     def _plan_and_move(self, group: CanopenGroup) -> None:
         kept: list[Experiment] = []

@@ -1,7 +1,7 @@
 """Bring a backup back, or take a write back that was cut off."""
 
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -26,6 +26,7 @@ from drives.parameters import (
     check_disabled,
     check_objects,
     check_same_drives,
+    check_set_up,
     load_backup,
     load_journal,
 )
@@ -190,6 +191,7 @@ def bring_back(
     for part in parts:
         drive, record = by_axis[part.axis], journal.drive(part.axis)
         check_objects(drive, (h.info for h in part.held), source.backup_path, "backup")
+        check_set_up(part.axis, part.set_up, source.backup_path)
         journal_path = source.backup_path.with_name(JOURNAL)
         check_objects(drive, (e.info for e in record.entries), journal_path, "write journal")
         if journal.storing is Storing.ALL or record.memory in (Memory.NEW, Memory.UNKNOWN):
@@ -209,7 +211,8 @@ def bring_back(
             say(f"{step.axis}: comparing {counts[step.axis]} parameters, and bringing them back")
         tell_storing(drives, say)(step)
 
-    transaction = Transaction(taking_part, journal, source.backup, keeper, tell)
+    backup = source.backup if source.cut_off else _without_set_up(source.backup)
+    transaction = Transaction(taking_part, journal, backup, keeper, tell)
     try:
         with keeper:
             transaction.restore()
@@ -229,6 +232,11 @@ def bring_back(
         left_out=tuple(p.axis for p in source.backup.drives if p.axis in without),
         notes=tuple(notes),
     )
+
+
+def _without_set_up(backup: Backup) -> Backup:
+    """Return what is brought back where no motion was cut off: how PDOs are set up is no parameter."""
+    return replace(backup, drives=tuple(replace(part, set_up=()) for part in backup.drives))
 
 
 def journal_back(machine: str, source: Source, store: bool) -> Journal:

@@ -1,5 +1,6 @@
 """Note that drives hold other values for the time of a measurement, should it be cut off."""
 
+import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -18,9 +19,10 @@ from fieldtool.writeback.unfinished import JOURNAL, JournalKeeper, not_kept
 def backed_up(machine: str, drives: Sequence[CanopenDrive], backup_path: Path) -> Iterator[None]:
     """Back all parameters up, and leave a note for as long as the drives may hold others.
 
-    A measurement switches feed-forward off and arms fail-safe objects, and puts them back when it
-    ends, however it ends.  If the tool is killed it can not; then the note makes the next session
-    ask for ``fieldtool restore``, so that no later backup takes such values for the machine's own.
+    A measurement switches feed-forward off, arms fail-safe objects and maps PDOs, and puts all of it
+    back when it ends, however it ends.  If the tool is killed, or a drive can not be reached any more,
+    it can not; then the note makes the next session ask for ``fieldtool restore``, so that no later
+    backup takes such values for the machine's own.
     The journal of a write that has ended is put back afterwards: it says what the drives have stored.
 
     Raises
@@ -42,4 +44,11 @@ def backed_up(machine: str, drives: Sequence[CanopenDrive], backup_path: Path) -
         try:
             yield
         finally:
-            keeper.forget(journal, before)
+            left = [drive.axis for drive in drives if drive.left_changed]
+            if not left:
+                keeper.forget(journal, before)
+            elif (cause := sys.exc_info()[1]) is not None:
+                cause.add_note(
+                    f"{', '.join(left)}: not everything could be put back as it was. Once all drives "
+                    f"can be reached again: fieldtool restore {backup.parent}"
+                )

@@ -110,7 +110,7 @@ class Result:
     enabled_again: bool
     """Whether a drive was enabled again after all had reacted."""
     restored: str
-    """What `fieldtool restore` came to where the write-back was not restored; else empty."""
+    """What was wrong with `fieldtool restore`, where something was left to be put back; else empty."""
 
     def cycles(self, *without: int) -> float:
         """Cycles until every drive that was on had left operation enabled."""
@@ -257,7 +257,7 @@ class Bench:
     def _result(self, code: int, said: str) -> Result:
         rows, complete = self._recorded()
         nodes = self.machine.nodes
-        changed = {n.node_id: self._changed(n) for n in nodes}
+        changed = self._all_changed()
         gains = {n.node_id: self._kind(n, n.dictionary.read) for n in nodes}
         stored = {n.node_id: self._kind(n, self._after_power_cycle(n)) for n in nodes}
         still_on = tuple(n.node_id for n in nodes if n.motion.powered)
@@ -268,13 +268,18 @@ class Bench:
             self.watch,
             rows,
             complete,
-            {node: what for node, what in changed.items() if what},
+            changed,
             gains,
             stored,
             still_on,
             self._enabled_again,
-            self._restored() if code in (4, 6, 7) and self.moment is Moment.WRITE else "",
+            self._restored() if self._is_left(code, changed) else "",
         )
+
+    def _is_left(self, code: int, changed: Mapping[int, Mapping[str, Any]]) -> bool:
+        if self.moment is Moment.WRITE:
+            return code in (4, 6, 7)
+        return self.moment is not Moment.CONNECTING and any(changed.values())
 
     def _restored(self) -> str:
         """Mend everything, and let the tool restore: all old, whatever it was."""
@@ -282,7 +287,15 @@ class Bench:
             self.machine.lift(fault)
         code, said = command("restore", self.out)
         gains = {self._kind(n, n.dictionary.read) for n in self.machine.nodes}
-        return "" if code == 0 and gains == {"old"} else f"restore: {code}, {gains}: {said}"
+        left = {} if self.moment is Moment.WRITE else self._all_changed()
+        if code == 0 and gains == {"old"} and not left:
+            return ""
+        return f"restore: {code}, {gains}, {left}: {said}"
+
+    def _all_changed(self) -> dict[int, dict[str, tuple[Any, Any]]]:
+        """Return what is not as it was before, by node; nodes where all is are left out."""
+        changed = {n.node_id: self._changed(n) for n in self.machine.nodes}
+        return {node: what for node, what in changed.items() if what}
 
     def _recorded(self) -> tuple[tuple[int, ...], tuple[bool, ...]]:
         try:

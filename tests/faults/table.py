@@ -600,6 +600,8 @@ def problems(result: Result, expected: Expected, moment: Moment) -> list[str]:
     if moment is Moment.WRITE:
         found += _written(result)
     else:
+        if result.restored:
+            found.append(result.restored)
         if set(result.gains.values()) != {"old"}:
             found.append(f"gains were changed: {result.gains}")
         found += _kept(result, expected, moment)

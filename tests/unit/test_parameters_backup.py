@@ -31,6 +31,9 @@ class FakeDrive:
     def writable_parameters(self):
         return iter(self.values)
 
+    def read_optional(self, info):
+        return None
+
     def read(self, info):
         value = self.values[info]
         if isinstance(value, Exception):

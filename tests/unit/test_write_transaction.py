@@ -110,6 +110,8 @@ class FakeDrive:
     def power_state(self):
         return PowerState.SWITCH_ON_DISABLED
 
+    left_changed = False
+
     def answers(self):
         return True
 
