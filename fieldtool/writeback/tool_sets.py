@@ -177,7 +177,7 @@ def keep_session(
         known = {held.info.address: held for held in part.held}
         now = known | {i.address: HeldObject(i, value) for i, value in written.items()}
         own = controller.get(part.axis, ())
-        parts.append(replace(part, held=tuple(now[a] for a in own if a in now)))
+        parts.append(replace(part, held=tuple(now[a] for a in own if a in now), set_up=()))
     verified, figures = trial_of(folder.verification, journal.drives)
     return _keep(machine, name, str(session), verified, figures, parts)
 
@@ -192,7 +192,8 @@ def keep_drives(
     parts = []
     for part in back_up(machine, drives).drives:
         own = set(controller.get(part.axis, ()))
-        parts.append(replace(part, held=tuple(h for h in part.held if h.info.address in own)))
+        held = tuple(h for h in part.held if h.info.address in own)
+        parts.append(replace(part, held=held, set_up=()))
     return _keep(machine, name, "drives", False, {}, parts)
 
 
