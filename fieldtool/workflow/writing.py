@@ -11,6 +11,7 @@ from fieldtool.records.model import MachineModel
 from fieldtool.workflow.session import Options, Session, parameter_table
 from fieldtool.workflow.verified import Verified
 from fieldtool.workflow.verifying import Verification
+from fieldtool.writeback.earlier import refuse_other_drives
 from fieldtool.writeback.transaction import WriteBack, apply, changes_for
 
 Confirm = Callable[[Sequence[Change]], bool]
@@ -48,6 +49,8 @@ def written(
 
     Raises
     ------
+    WrongDeviceError
+        If the session was begun on other drives.
     PlanRefusedError
         If something is to be stored untried, or the new parameters are bad by the model.
     OscillationError
@@ -69,6 +72,7 @@ def written(
             "only parameters that were tried on the machine are stored: leave --no-verify or --store "
             "away. Nothing was written."
         )
+    refuse_other_drives(session.folder.parameters_before, group.drives)
     verification = None
     if options.verify:
         verification = Verification(session, group, tuning, model, believed=believed)

@@ -1,4 +1,4 @@
-"""What earlier writes from a session folder have left in the drives' non-volatile memory.
+"""What a session folder knows of the drives: which they were, and what earlier writes have left in them.
 
 No drive tells what it has stored, so what is known must not be lost: each journal in a folder takes it
 over from the one whose place it takes.
@@ -7,12 +7,50 @@ over from the one whose place it takes.
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-from drives.errors import ProfileError
-from drives.parameters import DriveRecord, Journal, Memory, load_journal
+from drives.errors import ProfileError, WrongDeviceError
+from drives.parameters import DriveRecord, Journal, Memory, load_backup, load_journal
 from drives.parameters.values import ParameterDrive
 
 FIRST_BACKUP = "parameters-before.yaml"
 """From before the tool changed anything: what ``fieldtool restore FOLDER`` brings back."""
+
+
+def refuse_other_drives(backup_file: Path, drives: Iterable[ParameterDrive]) -> None:
+    """Refuse to write what was designed for other drives than those that are there now.
+
+    Parameters
+    ----------
+    backup_file
+        The session's first backup; where there is none that can be read, nothing is known.
+    drives
+        Identified.
+
+    Raises
+    ------
+    WrongDeviceError
+        With axis and numbers.
+    """
+    try:
+        parts = load_backup(backup_file).drives if backup_file.is_file() else ()
+    except ProfileError:
+        return
+    by_axis = {part.axis: part for part in parts}
+    for drive in drives:
+        part, now = by_axis.get(drive.axis), drive.identity
+        if part is None:
+            continue
+        for number, was, found in (
+            ("vendor-ID", part.vendor_id, now.vendor_id),
+            ("product code", part.product_code, now.product_code),
+            ("serial number", part.serial_number, now.serial_number),
+        ):
+            if was != found:
+                raise WrongDeviceError(
+                    f"{drive.axis}: this session was begun on a drive with {number} {was}, node "
+                    f"{drive.node_id} now has {found}. New parameters are written only into the drives "
+                    "that they were designed for. Were node ids swapped? If a drive was exchanged on "
+                    "purpose, measure the machine again: fieldtool run. Nothing was moved or written."
+                )
 
 
 def left_before(journal_file: Path, drives: Iterable[ParameterDrive]) -> Mapping[str, Memory]:

@@ -459,6 +459,20 @@ def test_a_backup_of_another_drive_is_refused(session, make_bench):
     assert other.changed() == {}
 
 
+def test_node_ids_that_were_swapped_since_the_measurement_are_seen(session):
+    """What was designed for one drive is not written into another."""
+    assert session.command("write", session.out, "--yes").code == 0
+    assert session.command("restore", session.out).code == 0
+    for node, serial in ((11, 1012), (12, 1011)):
+        session.machine.node(node).dictionary.force(0x1018, 4, serial)
+    held = session.objects()
+    outcome = session.command("write", session.out, "--yes")
+    assert outcome.code == 3
+    assert "table: this session was begun on a drive with serial number 1011" in outcome.err
+    assert "node 11 now has 1012" in " ".join(outcome.err.split())
+    assert session.objects() == held
+
+
 @pytest.mark.parametrize(
     "damage",
     [
