@@ -28,7 +28,7 @@ FIRST_OBJECT = 0x1000
 """Below are data types."""
 _MANDATORY = ("mandatoryobjects", "optionalobjects", "manufacturerobjects")
 _SECTION = re.compile(r"^\s*\[([^\]\r\n]*)\]", re.MULTILINE)
-_COMPACT = re.compile(r"^\s*(?:CompactSubObj|SubNumber|NrOfEntries)\s*=\s*(\S+)", re.M | re.I)
+_COMPACT = re.compile(r"^\s*(?:CompactSubObj|SubNumber|NrOfEntries)\s*[=:]\s*(\S+)", re.M | re.I)
 _MOST_SUBINDICES = 255
 _READABLE = ("ro", "rw", "rwr", "rww", "const")
 WRITABLE = ("rw", "rwr", "rww")
