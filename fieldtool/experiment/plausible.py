@@ -25,6 +25,8 @@ LEAST_SPEED = 0.3
 MOST_FRICTION = 0.5
 """Share of the torque for inertia that friction and springs may take in a move that is judged: with
 more, friction that builds up looks like inertia."""
+TAPER = 0.25
+"""Share of a move's rows over which what is left of its fit may hang together."""
 LONGEST_LAG = 0.3
 """s by which an axis may follow its targets."""
 
@@ -122,19 +124,40 @@ def inertia_of_move(
     scale = np.maximum(np.abs(matrix).max(axis=0), 1e-300)
     found, *_ = np.linalg.lstsq(matrix / scale, wanted, rcond=None)
     rest = wanted - (matrix / scale) @ found
-    spread = float(rest.std()) * np.sqrt(wanted.size / max(wanted.size - 5, 1))
-    covariance = np.linalg.pinv((matrix / scale).T @ (matrix / scale))
+    free = np.sqrt(rest.size / max(rest.size - 5, 1))
+    weights = np.linalg.pinv(matrix / scale)[0]
     others = (matrix / scale)[:, 1:4] @ found[1:4]
     size = float(np.abs(matrix[:, 0]).mean())
     steps = np.diff(np.unique(torque))
     rounding = float(steps.min()) / 2 / size if steps.size else float("inf")
-    fitted = spread * float(np.sqrt(covariance[0, 0])) / float(scale[0])
+    fitted = float(free * coefficient_std(weights, rest) / scale[0])
     return MoveInertia(
         float(found[0] / scale[0]),
         float(np.hypot(fitted, rounding)),
         size,
         float(np.abs(others - others.mean()).mean()),
     )
+
+
+def coefficient_std(weights: FloatArray, rest: FloatArray) -> float:
+    """Return the standard error of a weighted sum of rows, from what a fit leaves in them.
+
+    What is left is no white noise where the motor cogs or its load swings: neighbouring rows are off
+    together.  Their covariance is that of the rest, tapered over a quarter of the rows (Newey and
+    West 1987, A simple, positive semi-definite covariance matrix).
+
+    Parameters
+    ----------
+    weights, rest
+        Each of shape (n,).
+    """
+    n = rest.size
+    products = [
+        np.fft.irfft(np.square(np.abs(np.fft.rfft(one, 2 * n))))[:n] for one in (weights, rest)
+    ]
+    taper = np.clip(1.0 - np.arange(n) / max(TAPER * n, 1.0), 0.0, None)
+    sums = taper * products[0] * products[1] / n
+    return float(np.sqrt(max(sums[0] + 2.0 * sums[1:].sum(), 0.0)))
 
 
 def _lag(reference: FloatArray, position: FloatArray, step: float) -> float:
