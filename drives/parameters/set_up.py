@@ -6,6 +6,7 @@ belong to whoever uses the bus.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from itertools import groupby
 from pathlib import Path
 
@@ -21,7 +22,7 @@ from drives.canopen_drive.setup import (
     kind_of,
 )
 from drives.canopen_drive.torque_offset import TORQUE_OFFSET
-from drives.errors import DrivesError, ProfileError
+from drives.errors import DrivesError, ProfileError, SdoAbortError
 from drives.objects import ObjectAddress, ObjectInfo
 from drives.parameters.values import HeldObject, ParameterDrive, same
 
@@ -45,17 +46,20 @@ def read_set_up(drive: ParameterDrive) -> tuple[HeldObject, ...]:
         if not first:
             continue
         held += [*first, *_held(drive, kind_of(communication))]
-        count = drive.read_optional(count_of(mapping)) or 0
-        for k in range(1, min(max(count, len(OUTPUTS)), MOST_ENTRIES) + 1):
+        count = [*_held(drive, count_of(mapping))]
+        used = int(count[0].value) if count else 0
+        for k in range(1, min(max(used, len(OUTPUTS)), MOST_ENTRIES) + 1):
             held += _held(drive, entry_of(mapping, k))
-        held += _held(drive, count_of(mapping))
+        held += count
     return tuple(held)
 
 
 def _held(drive: ParameterDrive, info: ObjectInfo) -> Iterator[HeldObject]:
-    value = drive.read_optional(info)
-    if value is not None:
-        yield HeldObject(info, value)
+    """Yield what an object holds; nothing where the drive refuses to tell: then no motion changes it."""
+    with suppress(SdoAbortError):
+        value = drive.read_optional(info)
+        if value is not None:
+            yield HeldObject(info, value)
 
 
 def check_set_up(axis: str, held: Iterable[HeldObject], path: Path) -> None:
@@ -153,8 +157,10 @@ def _pdo_of(held: HeldObject) -> int:
 
 
 def _holds(drive: ParameterDrive, held: HeldObject) -> bool:
-    value = drive.read_optional(held.info)
-    return value is not None and same(held.info, value, held.value)
+    try:
+        return same(held.info, drive.read(held.info), held.value)
+    except SdoAbortError:
+        return False
 
 
 def _matters(held: HeldObject, counts: dict[int, int | float | str]) -> bool:

@@ -82,7 +82,7 @@ class MoveChecks:
                         self._plan_and_move(group)
                 finally:
                     for text in group.warnings:
-                        todo = "Switch the drive off and on."
+                        todo = f"Once all drives can be reached again: fieldtool restore {folder}"
                         self._findings.note("put back", "fail", text, todo=todo)
                     self._pace(group, bus)
         except UserStopError:

@@ -260,6 +260,10 @@ def open_session(
             for text in (*group.warnings, trace_problem(group.line.can_bus)):
                 if text:
                     session.warn(text)
+            if any(drive.left_changed for drive in group.drives):
+                session.warn(
+                    f"Once all drives can be reached again: fieldtool restore {folder.path}"
+                )
     except BaseException as error:
         folder.note("ended", error=type(error).__name__, text=str(error))
         if not keep_profile and folder.recording.is_file():

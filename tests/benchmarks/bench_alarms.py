@@ -3,7 +3,8 @@
 Random machines of two coupled axes: dry friction up to a fifth of the torque limit (Coulomb, Stribeck),
 backlash, encoders of 2000 to 8 million counts a turn, soft and stiff springs, slow and fast loops, noisy
 torques, prior masses wrong by up to a factor of two, slow and fast buses.  Each is measured by the fast
-plan on the lock-step bus, as a user would.
+plan on the lock-step bus, as a user would.  Of every second machine the watch does not get 4 % of the
+samples, as on a bus that loses cycles.
 
 A false alarm is exit code 4 with a sentence of a watch.  ``dead`` and ``pushed`` are the worst shares
 of the watch's bounds that sound axes came to: 1 is an alarm.  Loops are stiff enough to move their axis
@@ -39,6 +40,8 @@ TORQUE = 6.0
 """N m, the limit of both axes."""
 WIDEST = 0.015
 """rad by which friction may hold an axis beside its target."""
+LOST = 0.04
+"""Share of the samples that the watch does not get, of every second machine."""
 worst = {"dead": 0.0, "pushed": 0.0}
 
 
@@ -103,11 +106,13 @@ def main() -> int:
     if seed is None:
         seed = int(np.random.SeedSequence().generate_state(1)[0])
     print(f"seed {seed}, {given.machines} machines", flush=True)
-    _note_shares()
+    loses = _note_shares(np.random.default_rng([seed, given.machines]))
     began, false, most, codes = time.process_time(), 0, [0.0, 0.0], []
     for k in range(given.machines):
         profile, said = random_machine(np.random.default_rng([seed, k]))
         worst.update(dead=0.0, pushed=0.0)
+        loses[0] = LOST * (k % 2)
+        said += ", cycles lost" * (k % 2)
         code, text = _measured(profile, f"sound-{k}")
         alarm = code == 4 and ("Both look the same" in text or "does not move" in text)
         false += alarm
@@ -125,17 +130,23 @@ def main() -> int:
     return int(false > 0)
 
 
-def _note_shares() -> None:
-    take = Unseen.take
+def _note_shares(rng: np.random.Generator) -> list[float]:
+    """Note how near the watch comes to its bounds; return the share of samples it loses, to be set."""
+    take, loses, lost = Unseen.take, [0.0], dict[int, float]()
 
-    def noted(self: Unseen, position: int, torque: int) -> None:
-        take(self, position, torque)
+    def noted(self: Unseen, position: int, torque: int, cycles: float = 1.0) -> None:
+        cycles += lost.pop(id(self), 0.0)
+        if rng.random() < loses[0]:
+            lost[id(self)] = cycles
+            return
+        take(self, position, torque, cycles)
         if self._coasting and self._stood >= STOOD:
             worst["dead"] = max(worst["dead"], abs(self.way) / self.dead)
         elif not self._coasting and self.knows:
             worst["pushed"] = max(worst["pushed"], abs(self.way) / self.at_rest)
 
     Unseen.take = noted  # type: ignore[method-assign]
+    return loses
 
 
 def _measured(profile: dict[str, Any], channel: str) -> tuple[int, str]:
