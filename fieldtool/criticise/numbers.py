@@ -1,6 +1,6 @@
 """The numbers of a cause, as they are reported, with standard errors."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -9,6 +9,8 @@ from fieldtool.criticise.effects.base import Effect
 from fieldtool.criticise.search.afterwards import place_of
 from fieldtool.criticise.search.fit import Fitted
 
+WITH_ZERO = ("coulomb_positive", "coulomb_negative")
+"""Numbers that are as wrong as the zero of the torque's measurement where no offset is fitted beside."""
 UNDETERMINED = 3.0
 """Relative standard error from which it is said that a number is not known."""
 
@@ -34,8 +36,19 @@ def numbers_of(fitted: Fitted, effect: Effect) -> Mapping[str, Number]:
         rows = [index[d] for d in free]
         g = np.array(gradient)
         variance = float(g @ fitted.covariance[np.ix_(rows, rows)] @ g)
+        variance += _of_zero(fitted, effect, free)
         std = float(np.sqrt(max(variance, 0.0)))
         if not std < UNDETERMINED * max(abs(float(value)), 1e-300):
             std = float("nan")
         out[name] = Number(float(value), std, unit)
     return out
+
+
+def _of_zero(fitted: Fitted, effect: Effect, free: Sequence[str]) -> float:
+    """Return the variance that the zero of the torque's measurement adds where an effect contains it."""
+    machine = fitted.hypothesis.machine
+    name = f"{machine.model.names[effect.axis]}.offset"
+    if "offset" not in effect.replaces or not set(free) & set(WITH_ZERO):
+        return 0.0
+    zero = machine.variables[machine.names.index(name)]
+    return float(zero.scale * zero.known) ** 2

@@ -8,6 +8,7 @@ levels, two experiments a level, several periods each; then moves, where they ar
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import pi
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -196,9 +197,7 @@ def _multisine(machine: Machine, axis: int, phases: FloatArray) -> FloatArray:
     """Return the reference, one period, from which a rigid axis makes the motion that is wanted."""
     lines = _lines()
     omega = 2 * pi * lines / MULTISINE
-    time = np.arange(round(MULTISINE / PERIOD)) * PERIOD
     total = sum(machine.plant.chains[axis].masses)
-    turning = np.exp(1j * (np.outer(time, omega) + phases))
     moved = 1.0 / (1.0 + (omega / (2 * pi * SLOW)) ** 2)
     torque = total * omega**2 * moved
     position, proportional, integral = machine.gains[axis]
@@ -207,10 +206,18 @@ def _multisine(machine: Machine, axis: int, phases: FloatArray) -> FloatArray:
         velocity_loop * position
     )
     scale = min(
-        0.8 * machine.peak[axis] / np.abs((turning @ torque).real).max(),
-        0.4 * machine.travel[axis] / np.abs((turning @ moved).real).max(),
+        0.8 * machine.peak[axis] / np.abs(_course(torque, phases)).max(),
+        0.4 * machine.travel[axis] / np.abs(_course(moved, phases)).max(),
     )
-    return np.asarray(scale * (turning @ (moved * asked)).real)
+    return scale * _course(moved * asked, phases)
+
+
+def _course(sizes: NDArray[np.complexfloating[Any, Any]], phases: FloatArray) -> FloatArray:
+    """One period of a sum of waves at the lines."""
+    rows = round(MULTISINE / PERIOD)
+    spectrum = np.zeros(rows // 2 + 1, dtype=complex)
+    spectrum[_lines()] = sizes * np.exp(1j * phases)
+    return np.asarray(0.5 * rows * np.fft.irfft(spectrum, rows))
 
 
 def _moves(rng: np.random.Generator, travel: float, speed: float) -> FloatArray:

@@ -171,7 +171,8 @@ def friction_candidates(context: Context) -> list[Effect]:
                 0.1 * fastest, 0.3 * slow_share * fastest,
             )  # fmt: skip
             out.append(CoulombFriction(axis, (dry("torque"), reach, turn)))
-            both = ("coulomb_friction", "viscous_friction")
+            # A constant torque beside it would be the same but for the rows about each turn.
+            both = ("coulomb_friction", "viscous_friction", "offset")
             out.append(
                 AsymmetricFriction(
                     axis,

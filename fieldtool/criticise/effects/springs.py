@@ -16,8 +16,6 @@ LOSS = 0.05
 """Start value of the damper of a contact over the root of stiffness times mass."""
 BRANCHES = 7
 """Maxwell branches that make damping nearly the same at all frequencies."""
-MODES = 16
-"""Frequencies at which a further mass is tried."""
 
 
 def _dofs(context_first: int, spring: int) -> tuple[int, int]:
@@ -221,7 +219,7 @@ def spring_candidates(context: Context) -> list[Effect]:
 
 
 def mode_candidates(context: Context) -> list[Effect]:
-    """Return further masses at motor and load of every axis, over the band."""
+    """Return a further mass at motor and load of every axis; a search finds where in the band."""
     out: list[Effect] = []
     longest = max(m.rows * m.step for m in context.motions)
     low = 5.0 / longest
@@ -231,20 +229,19 @@ def mode_candidates(context: Context) -> list[Effect]:
         if context.torque_unit(axis) == "A":
             unit = f"A s2/{context.length_unit(axis)}"
         for place in ["motor"] + (["load"] if context.masses(axis) > 1 else []):
-            for f in np.geomspace(low, context.excited, MODES):
-                out.append(  # noqa: PERF401
-                    ExtraMode(
-                        axis,
-                        (
-                            Parameter("mass", unit, 0.0, 0.0, inertia, 0.01 * inertia, linear=True),
-                            Parameter(
-                                "frequency", "Hz", f, 0.5 * low, 1.1 * context.excited, 0.02 * f
-                            ),
-                            Parameter("damping_ratio", "1", 0.03, 0.0005, 0.5, 0.02),
+            out.append(  # noqa: PERF401
+                ExtraMode(
+                    axis,
+                    (
+                        Parameter("mass", unit, 0.0, 0.0, inertia, 0.01 * inertia, linear=True),
+                        Parameter(
+                            "frequency", "Hz", low, 0.5 * low, 1.1 * context.excited, 0.02 * low
                         ),
-                        place,
-                    )
+                        Parameter("damping_ratio", "1", 0.03, 0.0005, 0.5, 0.02),
+                    ),
+                    place,
                 )
+            )
     return out
 
 

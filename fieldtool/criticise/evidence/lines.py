@@ -8,7 +8,7 @@ periodic, and from a white level and the noise of the position where it is not.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -41,6 +41,8 @@ PART = 0.2
 """Of the noise that comes from the position, from which a line has to stand out of it."""
 STANDS_OUT = 30.0
 """Power of the torque over the noise at such a line."""
+NO_NOISE = 4.0
+"""Power over that of the quietest experiment, of torques as large, from which it is no noise."""
 LEAST_ROWS = 0.02
 """Share of rows that count, below which an axis is left out of a span."""
 DEPENDENT = 1e-8
@@ -167,12 +169,43 @@ def lines_of(
     # Where the motion is little but noise, a model that asks for less torque would seem the better one.
     drowned = (moved > PART * noise) & (torque < STANDS_OUT * noise)
     still = share < LEAST_ROWS
-    weight = np.where(still | drowned, 0.0, 1.0 / np.sqrt(noise))
+    counted = np.where(still | drowned, 0.0, 1.0)
+    return _weighed(replace(shape, weight=counted, unknown=tuple(unknown)), noise)
+
+
+def _weighed(lines: Lines, noise: FloatArray) -> Lines:
+    """Return the same with another noise; lines of no weight keep none."""
+    weight = np.where(lines.weight > 0.0, 1.0 / np.sqrt(noise), 0.0)
     stacked = np.zeros((2 * weight.size, 0))
-    if unknown:
-        stacked = np.column_stack([flat(shape.raw(c) * weight) for c in unknown])
-    free = _orthonormal(stacked)
-    return Lines(span, motion, window, weight, low_pass, noise, free, tuple(unknown))
+    if lines.unknown:
+        stacked = np.column_stack([flat(lines.raw(c) * weight) for c in lines.unknown])
+    return replace(lines, weight=weight, noise=noise, free=_orthonormal(stacked))
+
+
+def with_shared_noise(all_lines: Sequence[Lines]) -> list[Lines]:
+    """Take for noise no more than the quietest of like experiments lets expect, larger torques granted.
+
+    Where something changes while an experiment is measured, its periods differ, and not by noise.
+    """
+    periodic = [lines for lines in all_lines if lines.span.periods > 1]
+    rows = {id(a): a.span.stop - a.span.start for a in periodic}
+    powers = {id(a): np.sum(np.abs(a.raw(a.motion.torque)) ** 2, axis=0) for a in periodic}
+    out = []
+    for a in all_lines:
+        if id(a) not in powers:
+            out.append(a)
+            continue
+        own = np.arange(a.noise.shape[0]) / rows[id(a)]
+        noise = a.noise.copy()
+        for b in periodic:
+            theirs = np.arange(b.noise.shape[0]) / rows[id(b)]
+            for k in range(noise.shape[1]):
+                granted = NO_NOISE * max(1.0, powers[id(a)][k] / max(powers[id(b)][k], 1e-300))
+                level = np.interp(own, theirs, b.noise[:, k]) * rows[id(b)] / rows[id(a)]
+                if np.any(b.weight[:, k] > 0.0):
+                    noise[:, k] = np.minimum(noise[:, k], granted * level)
+        out.append(a if np.array_equal(noise, a.noise) else _weighed(a, noise))
+    return out
 
 
 def _less(shape: Lines, error: FloatArray, unknown: Sequence[FloatArray]) -> ComplexArray:

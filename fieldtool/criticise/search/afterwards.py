@@ -7,7 +7,7 @@ import numpy as np
 
 from fieldtool.criticise.effects.base import Effect
 from fieldtool.criticise.effects.friction import friction_candidates
-from fieldtool.criticise.search.fit import Fitted, fit
+from fieldtool.criticise.search.fit import EXACTLY, Fitted, fit
 from fieldtool.criticise.search.hypothesis import Hypothesis
 from fieldtool.criticise.search.judge import (
     difference,
@@ -235,7 +235,7 @@ def with_directions(
         base = swapped.base.copy()
         base[machine.names.index(name)] = 0.0
         swapped = replace(swapped, base=base, values=(*swapped.values[:-1], start))
-        fitted = fit(prepared.simulator, swapped)
+        fitted = fit(prepared.simulator, swapped, enough=EXACTLY)
         worse = difference(prepared.simulator, fitted, current)
         lost = worse.t >= ALIKE_T and worse.before - worse.after > tolerance(a.tried.gain)
         if lost or rival.implausible(

@@ -12,8 +12,8 @@ from fieldtool.criticise.search.hypothesis import Hypothesis, Simulator
 FloatArray = NDArray[np.float64]
 STEPS = 12
 """Most Gauss-Newton steps."""
-ENOUGH = 1e-4
-"""Relative gain of a step from which it is the last."""
+ENOUGH, EXACTLY = 1e-4, 1e-7
+"""Relative gain of a step from which it is the last, while searching and for what is reported."""
 TRIES = 6
 """Dampings tried a step."""
 LARGEST_FACTOR = 3.0
@@ -117,6 +117,7 @@ def fit(
     hypothesis: Hypothesis,
     steps: int = STEPS,
     shared: FloatArray | None = None,
+    enough: float = ENOUGH,
 ) -> Fitted:
     """Fit all free numbers to the rows of role ``fit``.
 
@@ -130,6 +131,9 @@ def fit(
     shared : ndarray
         Derivatives with respect to the machine's numbers at a hypothesis nearby, (rows, all
         variables): taken for the first steps, which saves most of the time.
+    enough : float
+        Relative gain of a step from which it is the last.  What the data hardly tell apart is where
+        it belongs only if this is small.
     """
     free = free_numbers(hypothesis)
     scales = np.array([f.scale for f in free])
@@ -183,7 +187,7 @@ def fit(
         promised = float(np.sum((values + 2 * damping) * step**2))
         current, vector, r, cost = tried, reached, r_tried, after
         damping = max(damping / 10, 1e-9)
-        if gained < ENOUGH * max(before, 1e-300) and (own or fresh or turn >= 1):
+        if gained < enough * max(before, 1e-300) and (own or fresh or turn >= 1):
             break
         if gained < RENEWED * promised:
             old = None
@@ -259,13 +263,14 @@ def _result(
     known: FloatArray,
     cost: float,
 ) -> Fitted:
-    rows = np.vstack([jacobian, np.diag(known)])
+    # What is known beforehand is as sure as it is, however well the data are explained.
+    level = max(cost / max(jacobian.shape[0] - len(free), 1), 1e-300)
+    rows = np.vstack([jacobian / np.sqrt(level), np.diag(known)])
     size = np.linalg.norm(rows, axis=0)
     size[size == 0.0] = 1.0
     _, s, vt = np.linalg.svd(rows / size, full_matrices=False)
     inverse = (vt.T / np.maximum(s, 1e-9 * s[0]) ** 2) @ vt
-    level = cost / max(jacobian.shape[0] - len(free), 1)
     shape = scales / size
-    covariance = level * inverse * np.outer(shape, shape)
+    covariance = inverse * np.outer(shape, shape)
     std = np.sqrt(np.diag(covariance))
     return Fitted(hypothesis, cost, tuple(f.name for f in free), vector, std, covariance)

@@ -10,8 +10,9 @@ from fieldtool.records.model import Estimate, MachineModel
 FloatArray = NDArray[np.float64]
 LIGHT = 0.01
 """Damping ratio that scales a damper whose value is zero."""
-OFFSET = 0.003
-"""Of the largest torque: how far the zero of a torque measurement may be off without a word."""
+OFFSET = 0.001
+"""Of the largest torque: standard error of the zero of a torque measurement.  Drives null their current
+sensors when they are switched on; thrice as much is seldom and told."""
 KNOWN = 1.0
 """Relative standard error of what is known of each other number beforehand: its size."""
 SMALLEST = 0.05

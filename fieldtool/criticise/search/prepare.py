@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fieldtool.criticise.effects.base import Context, band_limited
-from fieldtool.criticise.evidence.lines import Lines, lines_of
+from fieldtool.criticise.evidence.lines import Lines, lines_of, with_shared_noise
 from fieldtool.criticise.evidence.spans import Spans, spans_of, usable_experiments
 from fieldtool.criticise.search.hypothesis import Hypothesis, Simulator
 from fieldtool.criticise.search.machine import Machine
@@ -118,7 +118,7 @@ def reweighted(prepared: Prepared, hypothesis: Hypothesis) -> Prepared:
                 _from(free.get(span.experiment, []), span.start, motion.rows),
             )
         )
-    simulator = Simulator(prepared.motions, tuple(lines))
+    simulator = Simulator(prepared.motions, tuple(with_shared_noise(lines)))
     return replace(prepared, simulator=simulator)
 
 

@@ -9,12 +9,15 @@ from numpy.typing import NDArray
 from fieldtool.criticise.effects.base import Effect
 from fieldtool.criticise.search.fit import machine_derivatives
 from fieldtool.criticise.search.hypothesis import Hypothesis, Simulator
+from fieldtool.criticise.search.modes import best_mode
 
 FloatArray = NDArray[np.float64]
 MOST_OF_IT = (0.0, 2.0)
 """Bounds of how much of a start value's torque the data may ask for."""
-NEARBY, MODE_STEP, DAMPINGS = 5, 0.12, (0.02,)
-"""Frequencies tried about the best mode, their reach over it, and damping ratios."""
+SOONER = (1 / 8, 1 / 16, 1 / 32)
+"""Of an experiment: how far from where it was tried a change may be."""
+WORTH = 0.003
+"""Share of the error that a change explains, from which its time is looked for."""
 SMALLEST_PART = 0.02
 """Of a start value, that is left of it at least."""
 
@@ -67,29 +70,35 @@ def screened(
 ) -> list[Screened]:
     """Return the candidates by falling gain, for each place of each effect the best start only."""
     best: dict[object, Screened] = {}
-    for k, effect in enumerate(candidates):
+    for k, candidate in enumerate(candidates):
         advance(k / max(len(candidates), 1))
+        effect = candidate
+        if effect.name == "extra_mode":
+            effect = best_mode(simulator, at.hypothesis, at.side, at.basis, effect)
         one = _screen(simulator, at, effect)
         if one is not None and (effect.key not in best or one.gain > best[effect.key].gain):
             best[effect.key] = one
-    for one in [b for b in best.values() if b.effect.name == "extra_mode" and b.gain > 0.0]:
-        for effect in _nearby_modes(one.effect):
-            near = _screen(simulator, at, effect)
-            if near is not None and near.gain > best[effect.key].gain:
-                best[effect.key] = near
+    for one in [b for b in best.values() if b.effect.name == "stiffness_change"]:
+        best[one.effect.key] = _in_time(simulator, at, one)
     return sorted(best.values(), key=lambda s: -s.gain)
 
 
-def _nearby_modes(effect: Effect) -> list[Effect]:
-    """Return the same mode at frequencies nearby, and with less and more damping."""
-    out = []
-    mass, frequency, damping = effect.parameters
-    for f in np.linspace(-1.0, 1.0, NEARBY):
-        for ratio in DAMPINGS:
-            start = frequency.clipped(frequency.start * (1.0 + MODE_STEP * float(f)))
-            moved = replace(frequency, start=start), replace(damping, start=ratio)
-            out.append(replace(effect, parameters=(mass, *moved)))
-    return out
+def _in_time(simulator: Simulator, at: Tangent, one: Screened) -> Screened:
+    """Return the same change sooner or later, where more is gained."""
+    longest = max(m.rows * m.step for m in simulator.motions.values())
+    if one.gain < WORTH * float(at.side @ at.side):
+        return one
+    for reach in SOONER:
+        times = [one.start["time"] + sign * reach * longest for sign in (-1.0, 1.0)]
+        for time in times:
+            parameters = tuple(
+                replace(p, start=p.clipped(time)) if p.name == "time" else p
+                for p in one.effect.parameters
+            )
+            moved = _screen(simulator, at, replace(one.effect, parameters=parameters))
+            if moved is not None and moved.gain > one.gain:
+                one = moved
+    return one
 
 
 def _screen(simulator: Simulator, at: Tangent, effect: Effect) -> Screened | None:

@@ -20,8 +20,9 @@ from fieldtool.criticise.search.afterwards import (
     unharmful,
     unsigned,
 )
-from fieldtool.criticise.search.fit import Fitted, fit, strain
+from fieldtool.criticise.search.fit import EXACTLY, Fitted, fit, strain
 from fieldtool.criticise.search.hypothesis import Hypothesis, Simulator
+from fieldtool.criticise.search.instants import timed
 from fieldtool.criticise.search.judge import Parts, beyond_noise, difference, judged, moved
 from fieldtool.criticise.search.prepare import Prepared, reweighted
 from fieldtool.criticise.search.rules import (
@@ -176,7 +177,8 @@ def _on_all_rows(prepared: Prepared, current: Fitted) -> Fitted:
     lines = tuple(
         replace(one, span=replace(one.span, role="fit")) for one in prepared.simulator.lines
     )
-    return fit(Simulator(prepared.motions, lines), current.hypothesis)
+    simulator = Simulator(prepared.motions, lines)
+    return fit(simulator, current.hypothesis, enough=EXACTLY)
 
 
 def _round(
@@ -221,6 +223,8 @@ def _round(
         for k, one in enumerate(chosen):
             step((number + SCREENING + (1 - SCREENING) * k / len(chosen)) / len(starts))
             fitted = fit(simulator, _grown(start, one), shared=at.of_machine)
+            if one.effect.name == "stiffness_change":
+                fitted = timed(simulator, fitted, len(fitted.hypothesis.effects) - 1)
             key = one.effect.key
             if not np.isfinite(fitted.cost):
                 rejected[key] = (one.effect, "the simulated machine runs away with it")

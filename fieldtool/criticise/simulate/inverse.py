@@ -99,7 +99,7 @@ class HiddenSystem:
         """Return the motors' torques for each initial state (F, S), motors at rest, (F, rows, M)."""
         size = self.rates.shape[0]
         advance = np.ascontiguousarray(expm(self.rates * step)) if size else np.zeros((0, 0))
-        return np.asarray(ring(advance, self.readout[0], starts, rows))
+        return np.asarray(ring(advance, starts, rows) @ self.readout[0].T)
 
     def audible(self, step: float, rows: int) -> int:
         """Return the rows after which a free motion has faded, no more than ``rows``."""
@@ -170,9 +170,8 @@ class Driven:
         start = _start(structure, motion)
         if not structure.elements:
             advance, early, late, _, _ = self.tables
-            return np.asarray(
-                march(advance, early, late, of_state, of_input, motion.driven, u, start)
-            )
+            pushes = motion.driven[:-1] @ early.T + motion.driven[1:] @ late.T
+            return np.asarray(u @ of_input.T + march(advance, pushes, start) @ of_state.T)
         z, g = march_bent(
             *self.tables,
             motion.driven,

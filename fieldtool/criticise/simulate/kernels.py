@@ -26,56 +26,28 @@ def plus_row(total: float, matrix: FloatArray, row: int, vector: FloatArray) -> 
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
-def march(
-    step: FloatArray,
-    early: FloatArray,
-    late: FloatArray,
-    of_state: FloatArray,
-    of_input: FloatArray,
-    driven: FloatArray,
-    inputs: FloatArray,
-    start: FloatArray,
-) -> FloatArray:
-    """Return the motors' torques (n, M): of_state z[k] + of_input inputs[k], from z[0] = start.
-
-    z[k+1] = step z[k] + early driven[k] + late driven[k+1]; ``driven`` and ``inputs`` are (n, 3 M).
-    """
-    n, many = inputs.shape
-    size, M = start.size, of_input.shape[0]
-    out = np.empty((n, M))
-    z, following = start.copy(), np.empty(size)
-    for k in range(n):
-        for i in range(M):
-            total = 0.0
-            for j in range(many):
-                total += of_input[i, j] * inputs[k, j]
-            out[k, i] = plus_row(total, of_state, i, z)
-        if k + 1 == n:
-            break
+def march(step: FloatArray, pushes: FloatArray, start: FloatArray) -> FloatArray:
+    """Return the states (n, S) of z[k+1] = step z[k] + pushes[k] from z[0] = start."""
+    n, size = pushes.shape[0] + 1, start.size
+    z = np.empty((n, size))
+    z[0] = start
+    for k in range(n - 1):
         for i in range(size):
-            total = 0.0
-            for j in range(many):
-                total += early[i, j] * driven[k, j] + late[i, j] * driven[k + 1, j]
-            following[i] = plus_row(total, step, i, z)
-        z[:] = following
-    return out
+            z[k + 1, i] = plus_row(pushes[k, i], step, i, z[k])
+    return z
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
-def ring(step: FloatArray, of_state: FloatArray, starts: FloatArray, rows: int) -> FloatArray:
-    """Return the motors' torques from each initial state (F, S), (F, rows, M)."""
-    size, M, count = step.shape[0], of_state.shape[0], starts.shape[0]
-    out = np.zeros((count, rows, M))
-    z, following = np.empty(size), np.empty(size)
+def ring(step: FloatArray, starts: FloatArray, rows: int) -> FloatArray:
+    """Return the states (F, rows, S) that nothing pushes, from each initial one (F, S)."""
+    count, size = starts.shape
+    z = np.empty((count, rows, size))
     for first in range(count):
-        z[:] = starts[first]
-        for k in range(rows):
-            for i in range(M):
-                out[first, k, i] = plus_row(0.0, of_state, i, z)
+        z[first, 0] = starts[first]
+        for k in range(rows - 1):
             for i in range(size):
-                following[i] = plus_row(0.0, step, i, z)
-            z[:] = following
-    return out
+                z[first, k + 1, i] = plus_row(0.0, step, i, z[first, k])
+    return z
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
