@@ -5,7 +5,7 @@ was killed: they are no parameters, and are brought back after such a cut alone,
 belong to whoever uses the bus.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from itertools import groupby
 from pathlib import Path
@@ -62,8 +62,8 @@ def _held(drive: ParameterDrive, info: ObjectInfo) -> Iterator[HeldObject]:
             yield HeldObject(info, value)
 
 
-def check_set_up(axis: str, held: Iterable[HeldObject], path: Path) -> None:
-    """Refuse a file that names other objects as set up than a motion changes.
+def check_set_up(axis: str, held: Sequence[HeldObject], path: Path) -> None:
+    """Refuse a file that names other objects as set up than a motion changes, or in another order.
 
     Raises
     ------
@@ -77,6 +77,15 @@ def check_set_up(axis: str, held: Iterable[HeldObject], path: Path) -> None:
                 path,
                 f"{axis}, object {one.info.address} ({one.info.name}), {one.info.type}, is nothing that "
                 "a motion sets up; the backup was changed. Nothing was written.",
+            )
+    for pdo, part in groupby(held, _pdo_of):
+        addresses = [one.info.address for one in part]
+        mapping = [address for address in addresses if address.index != pdo]
+        if pdo and (addresses[0] != ObjectAddress(pdo, 1) or (mapping and mapping[-1].subindex)):
+            raise ProfileError(
+                path,
+                f"{axis}: the objects of the PDO 0x{pdo:04X} stand in another order than the tool reads "
+                "them; the backup was changed. Nothing was written.",
             )
 
 

@@ -78,20 +78,21 @@ def test_a_session_that_ended_leaves_pdos_to_who_uses_the_bus(tmp_path):
         assert bench._all_changed() == {}
 
 
-def test_a_file_can_not_make_the_tool_write_other_objects_as_set_up(tmp_path):
+@pytest.mark.parametrize("how", ["another object", "another order"])
+def test_a_file_can_not_make_the_tool_write_other_objects_as_set_up(tmp_path, how):
     with Bench(tmp_path, Moment.SWEEP, lambda _: ()) as bench:
         bench.prepare_write()
         assert command("write", bench.out, "--yes")[0] == 0
         path = bench.out / "parameters-before.yaml"
         backup = load_backup(path)
         one = backup.drives[0]
-        wrong = replace(
-            one.set_up[0], info=replace(one.set_up[0].info, address=ObjectAddress(0x6040))
-        )
-        save_backup(
-            replace(backup, drives=(replace(one, set_up=(wrong,)), *backup.drives[1:])), path
-        )
+        set_up = one.set_up[::-1]
+        if how == "another object":
+            info = replace(one.set_up[0].info, address=ObjectAddress(0x6040))
+            set_up = (replace(one.set_up[0], info=info),)
+        changed = replace(one, set_up=set_up)
+        save_backup(replace(backup, drives=(changed, *backup.drives[1:])), path)
         code, said = command("restore", bench.out)
         assert code == 2
-        assert "table, object 0x6040:00" in said
+        assert "table, object 0x6040:00" in said or "table: the objects of the PDO 0x1800" in said
         assert "Nothing was written." in said

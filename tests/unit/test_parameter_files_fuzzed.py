@@ -7,6 +7,7 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from drives.canopen_drive.setup import cob_id_of, kind_of
 from drives.errors import ProfileError
 from drives.objects import ObjectAddress, ObjectInfo
 from drives.parameters import (
@@ -37,7 +38,8 @@ def files(tmp_path_factory):
     record = DriveRecord("x", 5, 1, 2, 3, 4, entries)
     journal = Journal("m", "2026-01-01", "b.yaml", Storing.ALL, (record,))
     held = (HeldObject(INFO, 0.5), HeldObject(TEXT, "a"))
-    backup = Backup("m", "2026-01-01", (DriveBackup("x", 5, 1, 2, 4, 3, held),))
+    set_up = (HeldObject(cob_id_of(0x1400), 0x205), HeldObject(kind_of(0x1400), 255))
+    backup = Backup("m", "2026-01-01", (DriveBackup("x", 5, 1, 2, 4, 3, held, set_up),))
     save_journal(journal, folder / "write-journal.yaml")
     save_backup(backup, folder / "b.yaml")
     return folder, [
@@ -65,7 +67,7 @@ def test_a_changed_file_is_refused_in_words_or_is_whole(files, data):
     try:
         if which:
             loaded = load_backup(path)
-            values = [(h.info, h.value) for d in loaded.drives for h in d.held]
+            values = [(h.info, h.value) for d in loaded.drives for h in (*d.held, *d.set_up)]
             assert all(isinstance(d.node_id, int) for d in loaded.drives)
         else:
             journal = load_journal(path)
