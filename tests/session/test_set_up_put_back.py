@@ -64,6 +64,24 @@ def test_a_motion_that_was_cut_off_is_taken_back_whole(tmp_path, monkeypatch, mo
         assert not any(n.motion.powered for n in bench.machine.nodes)
 
 
+def test_a_check_that_lost_its_bus_leaves_what_restore_needs(tmp_path, monkeypatch):
+    """Its folder is removed otherwise; the next session names it."""
+    monkeypatch.chdir(tmp_path)
+    with Bench(tmp_path, Moment.STILL, lambda _: (BusOff(),)) as bench:
+        code, said = command("check", bench.profile, "--move")
+        assert code == 4, said
+        assert bench._all_changed().keys() == {TABLE, ARM}
+        (folder,) = (tmp_path / "sessions").iterdir()
+        assert f"fieldtool restore sessions/{folder.name}" in said
+        bench.machine.lift(BusOff())
+        code, said = command("measure", bench.profile, "--yes", "--out", tmp_path / "next")
+        assert code == 3
+        assert f"fieldtool restore {folder}" in said
+        code, said = command("restore", folder)
+        assert code == 0, said
+        assert bench._all_changed() == {}
+
+
 def test_a_session_that_ended_leaves_pdos_to_who_uses_the_bus(tmp_path):
     """A later `restore` of its parameters does not undo what another master has set up since."""
     with Bench(tmp_path, Moment.SWEEP, lambda _: ()) as bench:
