@@ -8,7 +8,8 @@ import numpy as np
 from drives.canopen_drive import CanopenGroup
 from fieldtool.design.servo import Servo
 from fieldtool.experiment.axes import Axes, torque_limits
-from fieldtool.experiment.verification.identity import LEAST_SEEN, IdentityWatch, Learned
+from fieldtool.experiment.verification.identity import IdentityWatch
+from fieldtool.experiment.verification.learned import LEAST_SEEN, Learned
 from fieldtool.experiment.verification.trial import Tried
 from fieldtool.experiment.verification.watch import Guards
 from fieldtool.experiment.verification.work import WorkRecord, WorkWatch

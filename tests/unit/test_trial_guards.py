@@ -14,8 +14,15 @@ from hypothesis import strategies as st
 
 from drives.api import AxisLimits
 from fieldtool.design.servo import Servo, Timing
-from fieldtool.experiment.verification.controller import DriveLoop, ExpectedTorque, locked_torque
-from fieldtool.experiment.verification.identity import BLIND, IdentityWatch, Learned
+from fieldtool.experiment.verification.controller import (
+    FROM_POSITION,
+    FROM_REFERENCE,
+    DriveLoop,
+    ExpectedTorque,
+    locked_torque,
+)
+from fieldtool.experiment.verification.identity import BLIND, IdentityWatch
+from fieldtool.experiment.verification.learned import Learned
 from fieldtool.experiment.verification.watch import Guards, TrialWatch
 from fieldtool.experiment.verification.work import WorkWatch
 from fieldtool.records.closed_loop import AxisLoop, Biquad
@@ -111,7 +118,9 @@ def trial_path(loop, count=COUNT, hold=100):
     ), hold
 
 
-def watch(loop, learned=None, noise=0.0, **changes):
+def watch(loop, learned=None, noise=0.0, encoder=None, **changes):
+    if encoder is not None:
+        changes["noise"] = encoder
     quanta = np.array([max(noise, 0.01)])
     if learned is None:
         learned = Learned(np.array([2 * noise]), np.array([0.3]), np.zeros(1))
@@ -171,6 +180,32 @@ def test_another_controller_shows_in_its_first_answer_within_some_counts(what):
     assert found is not None
     assert found <= hold + 50
     assert np.abs(position[:found]).max() < 500 * COUNT
+
+
+HIDDEN = {
+    "feedback": (0.1, {"velocity_p": 0.1, "velocity_i": 0.1}),
+    "position gain": (10.0, {"position_p": 10.0}),
+    "velocity gain": (0.2, {"velocity_p": 0.2, "velocity_i": 0.2, "position_p": 5.0}),
+}
+
+
+@pytest.mark.parametrize("name", HIDDEN)
+def test_gains_that_feed_forward_hides_are_named_with_their_factor(name):
+    """Feed-forward moves the axis nearly by itself, so torques are nearly as they should be."""
+    factor, changes = HIDDEN[name]
+    held = replace(GOOD, **{key: by * getattr(GOOD, key) for key, by in changes.items()})
+    fine = COUNT / 16
+    target, _ = trial_path(GOOD, fine)
+    position, torque = Axis(held).run(target, 0.02, 3, fine)
+    one = watch(GOOD, noise=0.02, encoder=drive(GOOD).noise / 16)
+    said = [
+        text
+        for q, t, r in zip(position, torque, target, strict=True)
+        for _, text in one.take([q], [t], [r], [0.0], fresh=True)
+    ]
+    told = [text for text in said if text.startswith(f"its {name} is ")]
+    assert told, said[:1]
+    assert float(told[-1].split(" is ")[1].split()[0]) == pytest.approx(factor, rel=0.4, abs=0.3)
 
 
 def test_what_comes_again_and_again_for_a_sample_is_seen_and_a_single_one_is_not():
@@ -257,8 +292,10 @@ def test_references_and_positions_are_two_parts_of_one_torque():
     targets = np.array([[1e-3] * 3 + [0.0], [0.0] * 4])
     parts = np.array([expected.advance(targets, np.full((2, 4), 1e-3)) for _ in range(20)])
     rises = np.diff(parts[-2:], axis=0)[0]
-    assert rises[0, 0] == pytest.approx(-rises[1, 0], rel=1e-6), "it stands at its target"
-    assert rises[0, 0] == pytest.approx(GOOD.velocity_i * GOOD.position_p * 1e-3 * STEP, rel=1e-6)
+    reference, position = rises[FROM_REFERENCE].sum(axis=0), rises[FROM_POSITION].sum(axis=0)
+    assert reference[0] == pytest.approx(-position[0], rel=1e-6), "it stands at its target"
+    assert reference[0] == pytest.approx(GOOD.velocity_i * GOOD.position_p * 1e-3 * STEP, rel=1e-6)
+    assert rises[0, 0] == pytest.approx(reference[0], rel=1e-6), "its position gain does it all"
     assert np.all(parts[:, 0, 1] == 0)
 
 

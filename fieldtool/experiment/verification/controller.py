@@ -16,7 +16,7 @@ Valid while no limit acts in the drive, and for motion well below half the bus' 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import exp, inf, pi, tan
 
 import numpy as np
@@ -26,6 +26,10 @@ from fieldtool.records.model import FloatArray
 
 REFERENCES, POSITIONS = 3, 4
 INPUTS = REFERENCES + 1 + POSITIONS
+PARTS = 5
+"""Of a torque: by reference what position gain, velocity gain and feed-forward of inertia (with the
+offset) make; by position what position gain and velocity gain make."""
+FROM_REFERENCE, FROM_POSITION = slice(0, 3), slice(3, 5)
 LATE = 2
 """Cycles from a SYNC to the one after which its torque is foretold, less one that is the newest."""
 
@@ -52,7 +56,7 @@ class DriveLoop:
 
 
 class ExpectedTorque:
-    """Follows several axes' controllers SYNC by SYNC; two parts are kept apart.
+    """Follows several axes' controllers SYNC by SYNC; its PARTS are kept apart.
 
     Parameters
     ----------
@@ -63,26 +67,25 @@ class ExpectedTorque:
     """
 
     def __init__(self, loops: Sequence[DriveLoop], step: float) -> None:
-        blocks = [_cycle_matrix(loop, step) for loop in loops]
+        blocks = [_parted(loop, step) for loop in loops]
         size, m = sum(a.shape[0] for a, _ in blocks), len(blocks)
-        self._a, self._b = np.zeros((size, size)), np.zeros((size, m, INPUTS))
+        self._a, b = np.zeros((size, size)), np.zeros((PARTS, size, m, INPUTS))
         self._out = np.zeros(m, dtype=np.int64)
         place = 0
-        for k, (a, b) in enumerate(blocks):
+        for k, (a, parts) in enumerate(blocks):
             rows = slice(place, place + a.shape[0])
-            self._a[rows, rows], self._b[rows, k] = a, b
+            self._a[rows, rows], b[:, rows, k] = a, parts
             place += a.shape[0]
             self._out[k] = place - 1
-        self._b_reference = self._b[:, :, : REFERENCES + 1].reshape(size, -1)
-        self._b_position = self._b[:, :, REFERENCES + 1 :].reshape(size, -1)
-        self._state = np.zeros((2, size))
+        self._b = b.reshape(PARTS * size, -1)
+        self._state = np.zeros((PARTS, size))
 
     def restart(self) -> None:
         """All axes stand where the signals' origin is."""
         self._state[:] = 0.0
 
     def advance(self, references: FloatArray, position: FloatArray) -> FloatArray:
-        """Return torques of all axes at the end of a cycle: by references and by position, (2, M).
+        """Return the parts of the torques of all axes at the end of a cycle, shape (PARTS, M).
 
         Parameters
         ----------
@@ -92,8 +95,8 @@ class ExpectedTorque:
         position
             At the SYNC before the cycle, at both its ends, and at the one after it, shape (M, 4).
         """
-        self._state[0] = self._a @ self._state[0] + self._b_reference @ references.ravel()
-        self._state[1] = self._a @ self._state[1] + self._b_position @ position.ravel()
+        given = np.concatenate([references, position], axis=1)
+        self._state = self._state @ self._a.T + (self._b @ given.ravel()).reshape(PARTS, -1)
         torque: FloatArray = self._state[:, self._out]
         return torque
 
@@ -115,8 +118,25 @@ def locked_torque(loop: DriveLoop, path: FloatArray, step: float) -> FloatArray:
     torque = np.zeros(path.size)
     for n in range(path.size - 1):
         row = np.array([[*padded[n : n + REFERENCES], 0.0]])
-        torque[n + 1] = expected.advance(row, still)[0, 0]
+        torque[n + 1] = expected.advance(row, still)[:, 0].sum()
     return torque
+
+
+def _parted(drive: DriveLoop, step: float) -> tuple[FloatArray, FloatArray]:
+    """Return A of one cycle, and B of each part, shape (PARTS, size, INPUTS)."""
+    a, whole = _cycle_matrix(drive, step)
+    loop = replace(drive.loop, position_p=0.0)
+    _, without = _cycle_matrix(replace(drive, loop=loop), step)
+    offsets = np.zeros_like(whole)
+    offsets[:, REFERENCES] = whole[:, REFERENCES]
+    bare = replace(loop, inertia_ff=0.0)
+    _, velocity = _cycle_matrix(replace(drive, loop=bare), step)
+    by_reference = np.arange(INPUTS) <= REFERENCES
+    velocity = velocity - offsets
+    parts = np.stack([whole - without, velocity, without - velocity] * 2)[:PARTS]
+    parts[FROM_REFERENCE] *= by_reference
+    parts[FROM_POSITION] *= ~by_reference
+    return a, parts
 
 
 def _cycle_matrix(drive: DriveLoop, step: float) -> tuple[FloatArray, FloatArray]:

@@ -15,18 +15,22 @@ It can not see a plant that is not as its model, nor a motor that pushes against
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from math import exp
 
 import numpy as np
 
 from fieldtool.experiment.verification.controller import (
+    FROM_POSITION,
+    FROM_REFERENCE,
     LATE,
+    PARTS,
     POSITIONS,
     REFERENCES,
     DriveLoop,
     ExpectedTorque,
 )
+from fieldtool.experiment.verification.gains import NAMES, GainEstimate
+from fieldtool.experiment.verification.learned import LEARNED, LEAST_LEARNED, Learned
 from fieldtool.records.model import FloatArray
 
 SETTLES = 0.05
@@ -50,38 +54,6 @@ BLIND, BLIND_AGAIN = 0.015, 0.1
 QUANTA, ENCODER, STILL = 3.0, 4.0, 2.5
 """Steps of the torque, times the RMS of what encoders' steps make, and times what was seen while all
 axes stood still, by which torques may differ at any time."""
-LEAST_SEEN = 0.5
-"""Share of its cycles that have to be compared for a trial to tell anything of controllers."""
-LEARNED, LEAST_LEARNED, MOST_LEARNED = 2.0, 0.8, 4.0
-"""Times the difference that was seen with the old parameters that is allowed with the new ones; of the
-usual one at least; and times the usual one above which a drive is not judged."""
-
-
-@dataclass(frozen=True, eq=False)
-class Learned:
-    """How well torques followed from parameters that are known to be in the drives; shapes (M,)."""
-
-    still: FloatArray
-    """Largest lasting difference while the axes stood still, N m or N."""
-    share: FloatArray
-    """Largest lasting difference of all, over what is usually allowed."""
-    late: FloatArray
-    """s, by which torques answered positions later or earlier than they should, by least squares."""
-    seen: float = 1.0
-    """Share of the cycles that were compared."""
-
-    def why_not(self) -> tuple[str, ...]:
-        """Return for each axis why it can not be judged by what was seen; empty where it can."""
-        if self.seen < LEAST_SEEN:
-            why = f"late cycles left {100 * self.seen:.0f} % of the trial of its old parameters"
-            return (why,) * self.share.size
-        return tuple(
-            f"with its old parameters its torque was up to {share:.2g} times as far from what they make "
-            "of target and position as is usual"
-            if LEARNED * share > MOST_LEARNED
-            else ""
-            for share in self.share.tolist()
-        )
 
 
 class IdentityWatch:
@@ -118,11 +90,14 @@ class IdentityWatch:
         self._passed = SETTLES / (SETTLES + step)
         self._kept = exp(-step / REMEMBERED)
         self._standing = True
+        self._off = np.zeros((len(NAMES), m))
         self._taken = self._compared = 0
+        self._gains: GainEstimate | None = None
         self.use(loops)
 
     def use(self, loops: Sequence[DriveLoop]) -> None:
         """Go on with other controllers: what is switched off for an excitation, say."""
+        self._off = self._off_so_far
         self._expected = ExpectedTorque(loops, self._step)
         learned = self._learned
         refused = ("",) * len(loops) if learned is None else learned.why_not()
@@ -136,6 +111,14 @@ class IdentityWatch:
         encoder = ENCODER * np.array([loop.noise for loop in loops])
         self._floor = QUANTA * self._quanta + encoder
         self._scale = np.ones(len(loops))
+        self._gains = GainEstimate(
+            self._quanta,
+            encoder / ENCODER,
+            np.array([loop.loop.position_p * self._step for loop in loops]),
+            self._late[1],
+            self._step,
+            None if learned is None else learned.gains,
+        )
         if learned is not None:
             self._floor = self._floor + STILL * learned.still
             self._scale = np.maximum(LEAST_LEARNED, LEARNED * learned.share)
@@ -164,7 +147,7 @@ class IdentityWatch:
         position, torque = self._rows[-LATE][:2]
         if self._count * self._step < SETTLED:
             return position.tolist(), torque.tolist()
-        expected = torque - self._quick[2] + self._quick[0] + self._quick[1]
+        expected = torque - self._quick[-1] + self._quick[:-1].sum(axis=0)
         return position.tolist(), np.where(self._judged, expected, torque).tolist()
 
     @property
@@ -177,7 +160,11 @@ class IdentityWatch:
         along, square, whole = self._lateness
         explains = along**2 > EXPLAINS * square * whole
         late = np.where(explains, np.abs(along) / np.maximum(square, TINY), 0.0)
-        return Learned(self._still.copy(), self._share.copy(), late, self.seen)
+        return Learned(self._still.copy(), self._share.copy(), late, self.seen, self._off_so_far)
+
+    @property
+    def _off_so_far(self) -> FloatArray:
+        return np.maximum(self._off, 0.0 if self._gains is None else self._gains.off)
 
     def take(
         self,
@@ -207,9 +194,12 @@ class IdentityWatch:
         m = position.size
         self._origin = position
         self._expected.restart()
-        self._before = np.zeros((3, m))
-        self._before[2] = torque
-        self._quick = np.zeros((3, m))
+        self._before = np.zeros((PARTS + 1, m))
+        self._before[-1] = torque
+        self._quick = np.zeros((PARTS + 1, m))
+        self._last = np.zeros((2, m))
+        if self._gains is not None:
+            self._gains.begin()
         self._peak, self._slope = np.zeros(m), np.zeros((2, m))
         self._over: list[FloatArray] = []
         self._squares: list[FloatArray] = []
@@ -223,16 +213,18 @@ class IdentityWatch:
         )
         positions = np.stack([one[0] - origin for one in rows[-POSITIONS:]])
         now = np.empty_like(self._before)
-        now[:2] = self._expected.advance(targets.T, positions.T)
-        now[2] = rows[-LATE][1]
+        now[:-1] = self._expected.advance(targets.T, positions.T)
+        now[-1] = rows[-LATE][1]
         quick = self._passed * (self._quick + now - self._before)
-        turns = (quick[1] - self._quick[1]) / self._step
-        slope = np.abs(quick[:2] - self._quick[:2]) / self._step
+        both = np.stack([quick[FROM_REFERENCE].sum(axis=0), quick[FROM_POSITION].sum(axis=0)])
+        changed, self._last = both - self._last, both
+        turns, slope = changed[1] / self._step, np.abs(changed) / self._step
         self._before, self._quick = now, quick
-        expected = quick[0] + quick[1]
-        difference = np.abs(quick[2] - expected)
+        expected = both[0] + both[1]
+        off = quick[-1] - expected
+        difference = np.abs(off)
         if self._learned is None and not self._standing:
-            self._lateness += (turns * (quick[2] - expected), turns**2, difference**2)
+            self._lateness += (turns * off, turns**2, difference**2)
         self._peak = np.maximum(np.abs(expected), self._kept * self._peak)
         self._slope = np.maximum(slope, self._kept * self._slope)
         allowed = self._floor + SHARE * self._peak + (self._late * self._slope).sum(axis=0)
@@ -241,8 +233,10 @@ class IdentityWatch:
         self._count += 1
         if self._count <= self._blind:
             # what enabling did to the torque, as at the first sample, is not theirs to explain
-            self._quick[2] = expected
+            self._quick[-1] = expected
             return []
+        parts = np.stack([quick[0] + quick[3], quick[1] + quick[4], quick[2], changed.sum(axis=0)])
+        gains = [] if self._gains is None else self._gains.take(parts, off)
         self._compared += 1
         self._over = [*self._over[1 - OF :], difference / allowed]
         capped = np.minimum(difference / (self._scale * allowed), ONE)
@@ -250,7 +244,8 @@ class IdentityWatch:
         self._far = [*self._far[1 - OF :], difference]
         if len(self._over) < SEEN:
             return []
-        return self._found(allowed)
+        wrong = [(k, _gain_sentence(name, by)) for k, name, by in gains if self._judged[k]]
+        return [*self._found(allowed), *wrong]
 
     def _found(self, allowed: FloatArray) -> list[tuple[int, str]]:
         lasting = self._scale / LASTING * np.sqrt(np.sum(self._squares, axis=0) / LASTS)
@@ -271,10 +266,17 @@ class IdentityWatch:
             self._share = np.maximum(self._share, over)
 
     def _sentence(self, k: int, allowed: float) -> str:
-        expected, told = float(self._quick[0, k] + self._quick[1, k]), float(self._quick[2, k])
+        expected, told = float(self._quick[:-1, k].sum()), float(self._quick[-1, k])
         unit = self._units[k]
         return (
             f"its torque is {told:.3g} {unit} where its parameters make {expected:.3g} {unit} of its "
             f"target and position (slow torques left out; {allowed:.2g} {unit} off is taken): what acts "
             "in the drive is not what was written"
         )
+
+
+def _gain_sentence(name: str, factor: float) -> str:
+    return (
+        f"its {name} is {factor:.2g} times what was written, by the torque that it makes of target and "
+        "position: what acts in the drive is not what was written"
+    )
