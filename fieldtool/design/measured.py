@@ -168,6 +168,9 @@ class AxisFigures:
     sensitivity_peak: float | None
     sensitivity_frequency: float | None
     """Hz."""
+    settling_latest: float | None = None
+    """s, of a prediction: settling time in a narrower band, from which it counts as touching the edge.
+    None: measured, or not known."""
 
     def as_dict(self) -> dict[str, float | None]:
         """Plain values; what is infinite is null."""
@@ -176,7 +179,10 @@ class AxisFigures:
 
 
 def axis_figures(
-    moves: Sequence[MoveFigures], peak_torque: float, sensitivity: Sensitivity | None
+    moves: Sequence[MoveFigures],
+    peak_torque: float,
+    sensitivity: Sensitivity | None,
+    settling_latest: float | None = None,
 ) -> AxisFigures:
     """Return the figures of an axis from its moves, of each the worst, and its sensitivity."""
     return AxisFigures(
@@ -188,4 +194,5 @@ def axis_figures(
         peak_torque,
         sensitivity.peak if sensitivity else None,
         sensitivity.peak_frequency if sensitivity else None,
+        settling_latest,
     )

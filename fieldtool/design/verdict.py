@@ -31,6 +31,9 @@ CURVE_OFF = 0.35
 GAINED, FEWEST = (0.2, 0.7), 3
 """Sensitivities between which a loop's gain shows (above noise, below where all loops come to 1), and
 lines there that are enough: the middle one of their logarithms is the gain of the loop that is off."""
+PEAK_DOUBT, TIME_DOUBT = 0.1, 0.15
+"""Shares by which a peak, and a settling time, are off their prediction at most as a rule: else it is
+said."""
 TIME_OFF, MOVE_OFF = 0.3, 0.05
 """Shares of the predicted settling time, and of the move's own time, by which settling may be off."""
 
@@ -176,11 +179,11 @@ def _worse(one: Comparison, before: AxisFigures, after: AxisFigures, cycle: floa
 
 def _unlike(one: Comparison, expected: AxisFigures, after: AxisFigures, cycle: float) -> list[str]:
     found = []
-    allowed = TIME_OFF * expected.settling_time + MOVE_OFF * one.duration + CYCLES * cycle
-    off = after.settling_time - expected.settling_time
-    if np.isfinite(after.settling_time) and np.isfinite(expected.settling_time) and off > allowed:
+    latest = _latest(expected)
+    allowed = TIME_OFF * latest + MOVE_OFF * one.duration + CYCLES * cycle
+    if np.isfinite(after.settling_time) and after.settling_time - latest > allowed:
         found.append(
-            f"settles in {after.settling_time:.3g} s after its move, {expected.settling_time:.3g} s was "
+            f"settles in {after.settling_time:.3g} s after its move, {_predicted_time(expected)} was "
             f"predicted; {allowed:.2g} s more is taken"
         )
     wanted, peak = expected.sensitivity_peak, after.sensitivity_peak
@@ -201,6 +204,46 @@ def _unlike(one: Comparison, expected: AxisFigures, after: AxisFigures, cycle: f
                 "designed"
             )
     return found
+
+
+def doubts(one: Comparison, cycle: float) -> tuple[str, ...]:
+    """Return what is off its prediction by more than is usual, though not by enough to be taken back.
+
+    Parameters
+    ----------
+    one
+        Of an axis whose new parameters are kept.
+    cycle
+        Of the bus, s.
+    """
+    expected, after = one.predicted, one.after
+    if expected is None or after is None:
+        return ()
+    found = []
+    wanted, peak = expected.sensitivity_peak, after.sensitivity_peak
+    if wanted and peak and abs(peak / wanted - 1) > PEAK_DOUBT:
+        found.append(f"peak of sensitivity is {peak:.3g}, {wanted:.3g} was predicted")
+    low, high = expected.settling_time, _latest(expected)
+    settles, slack = after.settling_time, CYCLES * cycle
+    if not (1 - TIME_DOUBT) * low - slack <= settles <= (1 + TIME_DOUBT) * high + slack:
+        found.append(f"settling time is {settles:.3g} s, {_predicted_time(expected)} was predicted")
+    return tuple(
+        f"{one.axis}: its {text}: good enough to be kept, but more than the usual "
+        f"{100 * PEAK_DOUBT:.0f} % (peak) or {100 * TIME_DOUBT:.0f} % (time) off. Measure anew if the "
+        "machine was changed."
+        for text in found
+    )
+
+
+def _latest(expected: AxisFigures) -> float:
+    """Return the settling time if a swing that is predicted to touch the band's edge leaves it, s."""
+    return max(expected.settling_time, expected.settling_latest or 0.0)
+
+
+def _predicted_time(expected: AxisFigures) -> str:
+    latest = _latest(expected)
+    more = f" (up to {latest:.3g} s: a swing touches the edge of the band)"
+    return f"{expected.settling_time:.3g} s" + (more if latest > expected.settling_time else "")
 
 
 def _gained(measured: Sensitivity, predicted: Sensitivity) -> list[str]:

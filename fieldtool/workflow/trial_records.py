@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fieldtool.design.excited import Periodic, excited
+from fieldtool.design.figures import move_figures
 from fieldtool.design.loops import Loops
 from fieldtool.design.machine import Machine, machine_of, respond
 from fieldtool.design.measured import (
@@ -26,6 +27,8 @@ from fieldtool.records.model import FloatArray, MachineModel
 from fieldtool.report.verification_picture import History
 from fieldtool.workflow.trial_plan import TrialPlan
 
+INSIDE = 0.9
+"""Of the band: a predicted swing that leaves this much may leave the band on the machine."""
 HIDDEN = 0.9
 """Share of the loop's own peak of sensitivity below which friction hides it from a small excitation."""
 
@@ -153,4 +156,9 @@ def _foreseen(prediction: Prediction, k: int, curve: Sensitivity | None) -> Axis
     axis = prediction.axes[k]
     if axis.move is None:
         return None
-    return axis_figures([axis.move], axis.peak_torque, curve)
+    latest = axis.move.settling_time
+    if axis.curves is not None:
+        curves, band = axis.curves, INSIDE * axis.move.band
+        narrow = move_figures(curves.time, curves.reference, curves.position, band)
+        latest = max(latest, narrow.settling_time)
+    return axis_figures([axis.move], axis.peak_torque, curve, latest)

@@ -23,7 +23,7 @@ from drives.errors import (
 from drives.parameters import Change
 from fieldtool.design.servo import Servo
 from fieldtool.design.tuning import SOFTEST, Tuning, why_not_stored
-from fieldtool.design.verdict import Comparison, faults
+from fieldtool.design.verdict import Comparison, doubts, faults
 from fieldtool.errors import IdentificationError, OutputError
 from fieldtool.experiment.axes import Axes, torque_limits
 from fieldtool.experiment.verification.oscillation import HOLD_LEVEL, LOUDEST
@@ -292,6 +292,9 @@ class Verification:
             same_times(one, before, foreseen_move(self._planned.after, k), after)
             for k, (one, before, after) in enumerate(self._histories)
         )
+        cycle = self._planned.trial.cycle_time
+        kept = () if reasons or not self._believed else compared
+        doubtful = [text for one in kept for text in doubts(one, cycle)]
         self.result = Verified(
             "restored" if reasons else "verified",
             reasons,
@@ -299,11 +302,13 @@ class Verification:
             self._changes,
             self._bound,
             "identified" if self._believed else "prior",
-            self._planned.trial.cycle_time,
-            (*self._planned.notes, *self._records.notes(compared)),
+            cycle,
+            (*self._planned.notes, *self._records.notes(compared), *doubtful),
             tuple(moves),
         )
         self._session.screen.verified(self.result)
+        for text in doubtful:
+            self._session.warn(text)
 
     def ended(self, error: BaseException | None) -> None:
         """Keep what came of it, once the write has ended: ``verified`` only if it ended well.

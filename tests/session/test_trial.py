@@ -11,7 +11,9 @@ from drives.errors import OscillationError, SafetyStopError, UserStopError
 from drives.sim.faults import Fault, MotorReversed
 from drives.sim.firmware import Parameter
 from fieldtool.experiment.axes import Axes
+from fieldtool.experiment.verification.steps import Steps
 from fieldtool.experiment.verification.trial import HOLD_TIME, Trial, TrialMove, run_trial
+from fieldtool.experiment.verification.watch import TrialWatch
 
 STEP = 0.001
 TABLE, ARM = 11, 12
@@ -231,6 +233,30 @@ def test_ctrl_c_ends_a_trial_with_all_drives_off(bench):
         try_it(bench, [], stop)
     assert bench.powered() == {}
     assert bench.changed() == {}
+
+
+@pytest.mark.parametrize(("hidden", "asked"), [(0, 1), (2, 3), (9, 4)])
+def test_a_first_answer_that_late_cycles_hid_is_asked_for_again(bench, hidden, asked):
+    probe = np.repeat([1.0, 2.0, 1.0, 0.0], 5) * 2 * np.pi / 2**20
+    streams, unseen = [], iter([False] * hidden)
+    with bench.connected() as group:
+        axes = axes_of(group)
+        one = replace(trial().moves[0], probe=probe, answer=1.0)
+        stream = Steps._stream
+
+        def noted(self, path, k, name, **more):
+            streams.append(path.copy())
+            return stream(self, path, k, name, **more)
+
+        with (
+            patch.object(Steps, "_stream", noted),
+            patch.object(TrialWatch, "saw", lambda *_: next(unseen, True)),
+        ):
+            again = replace(trial(), moves=(one,))
+            run_trial(group, again, axes, lambda _: None, "after", trusts_loops=True)
+    answers = [path for path in streams if np.abs(path).max() < 1e-4]
+    assert len(answers) == asked
+    assert all(np.count_nonzero(path) == np.count_nonzero(probe) for path in answers)
 
 
 def test_the_trial_holds_before_it_moves(bench):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fieldtool.design.measured import AxisFigures, Sensitivity
-from fieldtool.design.verdict import Comparison, faults
+from fieldtool.design.verdict import Comparison, doubts, faults
 
 GOOD = AxisFigures(0.1, 0.5, 0.001, 0.01, 0.001, 1.0, 1.5, 10.0)
 FREQUENCY = np.array([5.0, 10.0, 20.0])
@@ -28,6 +28,36 @@ def test_a_softer_machine_may_settle_later_where_the_old_parameters_are_beyond_t
     assert "5 % more" in faults(within, 0.001, 2.0, believed=True, softer=True)[0]
     later = replace(one, after=replace(slow, settling_time=0.6))
     assert "was predicted" in faults(later, 0.001, 2.0, believed=True, softer=True)[0]
+
+
+@pytest.mark.parametrize(
+    ("settles", "fault", "doubt"),
+    [(0.1, False, False), (0.45, False, False), (0.55, False, True), (0.7, True, True)],
+)
+def test_a_swing_that_touches_the_edge_of_the_band_may_leave_it_or_not(settles, fault, doubt):
+    """Predicted to settle after 0.1 s, or after 0.45 s if its last swing is a little larger."""
+    edge = replace(GOOD, settling_latest=0.45)
+    slow = replace(GOOD, settling_time=1.0)
+    after = replace(GOOD, settling_time=settles)
+    one = Comparison("x", "rad", 1.0, 0.5, 0.01, slow, edge, after, None, CURVE, CURVE)
+    assert bool(faults(one, 0.001, 2.0, believed=True)) == fault
+    assert bool(doubts(one, 0.001)) == doubt
+    known = replace(one, predicted=GOOD)
+    assert bool(faults(known, 0.001, 2.0, believed=True)) == (settles > 0.2)
+
+
+@pytest.mark.parametrize(
+    ("peak", "fault", "doubt"), [(1.6, False, False), (1.7, False, True), (1.85, True, True)]
+)
+def test_a_peak_that_is_off_by_more_than_usual_is_said_and_by_much_more_is_taken_back(
+    peak, fault, doubt
+):
+    after = replace(GOOD, sensitivity_peak=peak)
+    one = Comparison("x", "rad", 1.0, 0.5, 0.01, GOOD, GOOD, after, None, CURVE, CURVE)
+    assert bool(faults(one, 0.001, 2.0, believed=True)) == fault
+    assert bool(doubts(one, 0.001)) == doubt
+    if doubt:
+        assert f"{peak:.3g}, 1.5 was predicted" in doubts(one, 0.001)[0]
 
 
 def curve(size):

@@ -280,6 +280,19 @@ def test_samples_that_did_not_come_are_no_mismatch():
     assert hold * STEP > BLIND
 
 
+def test_cycles_are_compared_unbroken_only_some_time_after_a_sample_that_did_not_come():
+    target, hold = trial_path(GOOD)
+    position, torque = Axis(GOOD).run(target, 0.02, 1)
+    one = watch(GOOD, noise=0.02)
+    seen = []
+    for n, (q, t, r) in enumerate(zip(position, torque, target, strict=True)):
+        one.take([q], [t], [r], [0.0], fresh=n != hold)
+        seen.append(one.unbroken)
+    assert hold - 25 < seen[hold - 1] < hold
+    assert max(seen[hold : hold + 100]) == 0
+    assert seen[hold + 150] == pytest.approx(50, abs=8)
+
+
 def test_the_torque_of_a_locked_axis_is_the_same_by_both_ways():
     target, _ = trial_path(GOOD, hold=5)
     _, torque = Axis(GOOD, friction=1e9).run(target[:40])

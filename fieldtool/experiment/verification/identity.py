@@ -151,6 +151,11 @@ class IdentityWatch:
         return position.tolist(), np.where(self._judged, expected, torque).tolist()
 
     @property
+    def unbroken(self) -> int:
+        """Cycles up to the last one that were compared without a gap."""
+        return max(0, self._count - self._blind)
+
+    @property
     def seen(self) -> float:
         """Share of all cycles so far that were compared: late ones, and some after them, are not."""
         return self._compared / max(self._taken, 1)

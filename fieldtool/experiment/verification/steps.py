@@ -30,6 +30,11 @@ SHAKES = 1.5
 """Times the torque that a first answer should take, peak to peak, that is no swing yet."""
 PROBE_REST = 0.12
 """Seconds that are watched after a first answer."""
+REST_AGAIN = 0.12
+"""Seconds to wait before it is asked for again: controllers are not compared soon after a late cycle."""
+ASKED, MARGIN = 4, 8
+"""Times that a first answer is asked for, at most; and cycles of it that may be missing: the first ones
+of a trial, and the last ones, which are compared when later ones are known."""
 NO_PROBE: FloatArray = np.zeros(0)
 
 
@@ -85,7 +90,10 @@ class Steps:
         self._still, self._start, self._name, self._kept = still, start, name, kept
 
     def probe(self, move: TrialMove) -> None:
-        """Have an axis' controller answer before anything else moves: to some counts, in some cycles."""
+        """Have an axis' controller answer before anything else moves: to some counts, in some cycles.
+
+        Once more where late cycles hid it, up to ASKED times.
+        """
         if not move.probe.size:
             return
         k, step = move.axis, self._motion.cycle_time
@@ -97,7 +105,12 @@ class Steps:
             low, high, torque, PROBE_REST / 3, axis=k, shakes=SHAKES * move.answer
         )
         path = np.concatenate([move.probe, np.zeros(round(PROBE_REST / step))])
-        self._stream(path, k, f"{self._name}: first answer of {self._axes.names[k]}", keep=False)
+        name = f"{self._name}: first answer of {self._axes.names[k]}"
+        again = np.concatenate([np.zeros(round(REST_AGAIN / step)), path])
+        for one in (path, *[again] * (ASKED - 1)):
+            self._stream(one, k, name, keep=False)
+            if self._watch.saw(path.size - MARGIN):
+                break
 
     @property
     def _gentle_torque(self) -> FloatArray:

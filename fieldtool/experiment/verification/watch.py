@@ -56,6 +56,10 @@ class TrialWatch:
         if self._guards.identity is not None:
             self._guards.identity.stand(still=False)
 
+    def saw(self, cycles: int) -> bool:
+        """Return whether controllers were compared in all of the last cycles; true where nobody does."""
+        return self._guards.identity is None or self._guards.identity.unbroken >= cycles
+
     def take(
         self,
         position: Sequence[float],
