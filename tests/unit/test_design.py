@@ -89,14 +89,14 @@ def test_within_the_bound_on_the_true_machine(
     for axis in tuning.prediction.axes:
         assert axis.margins.sensitivity_peak <= 2.0 * 1.02
         assert axis.peak_torque <= 200.0 * true.axes[tuning.prediction.axes.index(axis)].total_mass
-    # not slower than the rule that it began with, on the machine itself, and stiffer
+    # not slower than the rule that it began with, on the machine itself; sooner or stiffer
     ruled = tuple(Servo(loop, timing=TIMING) for loop in rule(true))
     old = predict(true, ruled, tuning.moves)
     new = predict(true, servos, tuning.moves)
     total = [sum(arrival(a) for a in one.axes) for one in (old, new)]
     assert total[1] <= 1.25 * total[0]
     stiffer = [b.compliance / a.compliance for a, b in zip(old.axes, new.axes, strict=True)]
-    assert min(stiffer) < 0.9
+    assert total[1] < 0.9 * total[0] or min(stiffer) < 0.9
 
 
 @pytest.mark.parametrize("lengths", [(1,), (3,), (2, 1)], ids=str)

@@ -6,6 +6,7 @@ matrices.
 
 from dataclasses import dataclass, replace
 from math import copysign, exp
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -26,6 +27,7 @@ from fieldtool.experiment.verification.learned import Learned
 from fieldtool.experiment.verification.watch import Guards, TrialWatch
 from fieldtool.experiment.verification.work import WorkWatch
 from fieldtool.records.closed_loop import AxisLoop, Biquad
+from fieldtool.workflow import trial_records
 from fieldtool.workflow.trial_loops import first_answer
 
 STEP, PERIOD, LAG = 1e-3, 0.125e-3, 0.16e-3
@@ -386,3 +388,24 @@ def test_a_lost_sample_ends_what_is_reckoned_of_work():
     for n in range(200):
         guarded.take([n * COUNT], [-5.0], [0.0], [0.0], fresh=n % 20 != 19)
         assert n % 20 != 19 or work.missing == 0.0
+
+
+@pytest.mark.parametrize("by_torque", [True, False])
+def test_what_friction_leaves_of_an_excitation_is_foreseen_with_the_feed_forward_that_acts(
+    monkeypatch, by_torque
+):
+    """References excite with the feed-forward off that can be switched off; offsets with all of it."""
+    given = []
+    nothing = np.zeros(100)
+    monkeypatch.setattr(
+        trial_records, "excited", lambda _, servos, *__: given.append(servos) or (nothing, nothing)
+    )
+    monkeypatch.setattr(trial_records, "measured_sensitivity", lambda *_: None)
+    lines = SimpleNamespace(
+        by_torque=np.array([by_torque]), axis=np.zeros(1, int), number=np.ones(1, int), samples=100
+    )
+    one = SimpleNamespace(cycle_time=STEP, reference=np.zeros((1, 1)), torque=np.zeros((1, 1)))
+    trial = SimpleNamespace(excitation=SimpleNamespace(experiments=(one,)))
+    plan = SimpleNamespace(lines=lines, new=("all",), bare=("what stays",), trial=trial)
+    trial_records.TrialRecords(plan, None, None)._rubbing(None, lines, 0)
+    assert given == [plan.new if by_torque else plan.bare]
