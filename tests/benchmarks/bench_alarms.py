@@ -2,13 +2,14 @@
 
 Random machines of two coupled axes: dry friction up to a fifth of the torque limit (Coulomb, Stribeck),
 backlash, encoders of 2000 to 8 million counts a turn, soft and stiff springs, slow and fast loops, noisy
-torques, prior masses wrong by up to a factor of two, slow and fast buses.  Each is measured by the fast
-plan on the lock-step bus, as a user would.  Of every second machine the watch does not get 4 % of the
-samples, as on a bus that loses cycles.
+torques, prior masses wrong by up to a factor of two, slow and fast buses; on half of the axes one thing
+more: weights, magnets that cog, parts that hang on springs, what shakes the machine, delays, encoder
+errors.  Each is measured by the fast plan on the lock-step bus, as a user would.  Of every second
+machine the watch does not get 4 % of the samples, as on a bus that loses cycles.
 
-A false alarm is exit code 4 with a sentence of a watch.  ``dead`` and ``pushed`` are the worst shares
-of the watch's bounds that sound axes came to: 1 is an alarm.  Loops are stiff enough to move their axis
-against its friction, as a drive that was set up once is.
+A false alarm is exit code 4: the machine is sound, and was stopped.  ``dead`` and ``pushed`` are the
+worst shares of the watch's bounds that sound axes came to: 1 is an alarm.  Loops are stiff enough to
+move their axis against its friction, as a drive that was set up once is.
 
 Target: no false alarm.
 
@@ -43,6 +44,39 @@ WIDEST = 0.015
 LOST = 0.04
 """Share of the samples that the watch does not get, of every second machine."""
 worst = {"dead": 0.0, "pushed": 0.0}
+
+
+def _one_thing_more(rng: np.random.Generator) -> dict[str, Any]:
+    """Return an effect that a sound axis may have."""
+    share, phase = float(rng.uniform(0.2, 1.0)), float(rng.uniform(0, 6.28))
+    kinds: list[dict[str, Any]] = [
+        {"effect": "gravity", "torque": 0.25 * TORQUE * share, "angle": phase},
+        {
+            "effect": "cogging",
+            "torque": 0.05 * TORQUE * share,
+            "periods": int(rng.integers(4, 60)),
+            "phase": phase,
+        },
+        {
+            "effect": "periodic_disturbance",
+            "torque": 0.02 * TORQUE * share,
+            "frequency": float(rng.uniform(1.0, 50.0)),
+        },
+        {
+            "effect": "extra_mode",
+            "inertia": 0.01 * share,
+            "frequency": float(np.exp(rng.uniform(np.log(2.0), np.log(40.0)))),
+        },
+        {"effect": "measurement_delay", "time": 0.002 * share},
+        {"effect": "torque_lag", "time": 0.001 * share},
+        {
+            "effect": "encoder_error",
+            "amplitude": 5e-4 * share,
+            "periods": int(rng.integers(1, 100)),
+            "phase": phase,
+        },
+    ]
+    return kinds[rng.integers(len(kinds))]
 
 
 def random_machine(rng: np.random.Generator) -> tuple[dict[str, Any], str]:
@@ -87,10 +121,15 @@ def random_machine(rng: np.random.Generator) -> tuple[dict[str, Any], str]:
             )
         if truth["springs"] and rng.random() < 0.4:
             effects.append({"effect": "backlash", "joint": 1, "play": 0.002})
+        backlash = any(one["effect"] == "backlash" for one in effects)
+        more = _one_thing_more(rng) if rng.random() < 0.5 else None
+        if more:
+            effects.append(more)
+            axis["may_float"] = axis["may_float"] and more["effect"] != "gravity"
         truth["effects"] = effects
         said.append(
             f"{axis['name']}: {counts} counts, friction {100 * torque / TORQUE:.0f} %, loops x{slow:.1f}"
-            f"{', backlash' if len(effects) == 2 else ''}"
+            f"{', backlash' if backlash else ''}{', ' + str(more) if more else ''}"
         )
     said.append(f"springs x{soft:.1f}, prior masses x{prior:.1f}")
     return profile, "; ".join(said)
@@ -114,7 +153,7 @@ def main() -> int:
         loses[0] = LOST * (k % 2)
         said += ", cycles lost" * (k % 2)
         code, text = _measured(profile, f"sound-{k}")
-        alarm = code == 4 and ("Both look the same" in text or "does not move" in text)
+        alarm = code == 4
         false += alarm
         codes.append(code)
         most = [max(a, b) for a, b in zip(most, worst.values(), strict=True)]
@@ -127,7 +166,7 @@ def main() -> int:
         f"worst share of the bounds: dead {most[0]:.2f}, pushed {most[1]:.2f}; "
         f"{time.process_time() - began:.0f} s of CPU"
     )
-    return int(false > 0)
+    return int(false > 0 or 1 in codes)
 
 
 def _note_shares(rng: np.random.Generator) -> list[float]:
