@@ -37,7 +37,7 @@ PROOF_ERROR = 0.25
 """Share of the following error limit by which targets may leave where the axis stands."""
 PROOF_SLICE = 2
 """Cycles after which what the axis did is looked at."""
-SHOWN_COUNTS, NOISE_SHARE = 2, 0.5
+SHOWN_COUNTS, NOISE_SHARE = 2.5, 0.5
 """Counts, or that share of the range at rest, beyond the range at rest that are motion."""
 
 
@@ -124,6 +124,7 @@ class Proof:
         self._torques = [stiffness * size for size, _ in sizes]
         self._done, self._torque = 0, 0.0
         self._resting: list[float] = []
+        self._reached: list[float] = []
         self._pulls: list[float] = []
         self.asks = bool(sizes)
         """Whether there is a way to ask."""
@@ -184,9 +185,12 @@ class Proof:
             self._resting += position.tolist()
             self._pulls += torque.tolist()
             return
-        low, high = min(self._resting), max(self._resting)
-        beyond = max(SHOWN_COUNTS * float(self._axes.counts[self._k]), NOISE_SHARE * (high - low))
-        if position.min() < low - beyond or position.max() > high + beyond:
+        noise = max(self._resting) - min(self._resting)
+        beyond = max(SHOWN_COUNTS * float(self._axes.counts[self._k]), NOISE_SHARE * noise)
+        # friction may let go of it on either side of where it stood: what counts is from end to end
+        self._reached = [*self._reached, *position.tolist()]
+        self._reached = [min(self._reached), max(self._reached)]
+        if self._reached[1] - self._reached[0] > noise + beyond:
             self.answered = True
         else:
             most = float(np.abs(torque - np.mean(self._pulls)).max())
@@ -202,7 +206,7 @@ class Proof:
         raise SafetyStopError(
             f"{name}: does not move by its encoder: short pulses of torque up to {self._torque:.3g} "
             f"{'N m' if rotary else 'N'} ({100 * self._torque / limit:.0f} % of its limit) changed its "
-            f"position by less than {SHOWN_COUNTS + 1} counts; its power was cut and all axes were "
+            f"position by less than {ceil(SHOWN_COUNTS)} counts; its power was cut and all axes were "
             f"stopped. Without friction it has moved by at most {self._unseen():.2g} "
             f"{axes.unit(k)}. Either its encoder does not count (cable, supply), or it is blocked, its "
             "brake is closed, or friction holds it. All look the same from here: turn it by hand with "

@@ -282,13 +282,13 @@ class _Distinguishing(FastMeasurement):
     def _plan_after(
         self,
         recording: Recording,
-        pilot: MultisinePlan,  # noqa: ARG002 - what the others need to plan with
+        pilot: MultisinePlan,
     ) -> tuple[PlannedFast, Setting]:
         """See that the machine is still the one that was planned with, and that all limits are kept."""
         session, chosen = self._session, self._chosen
         if chosen is None:
             raise PlanRefusedError("nothing was planned")
-        found, known = self._read(recording)
+        found, known = self._read(recording, pilot.cycle_time)
         try:
             forecast_multisine(chosen, known)
         except PlanRefusedError:

@@ -12,22 +12,27 @@ from drives.profile import MachineProfile, load_machine
 from fieldtool.experiment.axes import Axes
 from fieldtool.experiment.directions import check_directions, small_moves
 from fieldtool.experiment.forecast import Setting
-from fieldtool.experiment.multisine.design import fast_cycle_times
+from fieldtool.experiment.multisine.design import fast_cycle_times, longest_cycle, mode_band
 from fieldtool.experiment.multisine.forecast import experiment_peaks
 from fieldtool.experiment.multisine.plan import MultisinePlan
 from fieldtool.experiment.multisine.runner import run_multisine
 from fieldtool.experiment.stepped.design import undamped_modes
 from fieldtool.identify.likelihood.expected import Noise
 from fieldtool.identify.multisine.pilot import PilotFindings, read_pilot
-from fieldtool.records.model import MachineModel
+from fieldtool.records.model import FloatArray, MachineModel
 from fieldtool.records.recording import Experiment, Recording, RecordingWriter
+from fieldtool.workflow.adapted import (
+    freed_of_friction,
+    torques_foreseen,
+    torques_of,
+    with_room_for_torque,
+)
 from fieldtool.workflow.models import check_torque_scale, prior_model
 from fieldtool.workflow.planning import (
     Advance,
     PlannedFast,
     Timing,
     Wanted,
-    freed_of_friction,
     plan_main,
     plan_pilot,
     timing,
@@ -45,8 +50,8 @@ TOLERATED = 1.05
 """Excitation time over what was asked for, above which it is said."""
 LATE_SHARE = 0.01
 """Of the pilot's cycles that may begin late; with more, the next longer cycle is tried."""
-TORQUE, FOLLOWING_ERROR = 3, 4
-"""Among an experiment's peaks."""
+FOLLOWING_ERROR = 4
+"""Row of an experiment's peaks."""
 SEED = 22
 """Of the random phases: the same machine gets the same plan."""
 
@@ -212,7 +217,7 @@ class FastMeasurement:
         screen.fast_plan(planned)
         return pilot
 
-    def _read(self, recording: Recording) -> tuple[PilotFindings, Setting]:
+    def _read(self, recording: Recording, cycle_time: float) -> tuple[PilotFindings, Setting]:
         """Return what the pilot found, and the machine by it; refuse what it shows to be wrong."""
         session = self._session
         session.screen.doing("find noise, friction and modes in the pilot")
@@ -220,8 +225,16 @@ class FastMeasurement:
         check_torque_scale(found.torque_ratio, self._setting.model)
         for note in found.notes:
             session.warn(note)
-        modes = ", ".join(f"{w / (2 * np.pi):.2f}" for w in undamped_modes(found.model)[0])
-        session.screen.say(f"Resonances found: {modes} Hz." if modes else "The axes are rigid.")
+        if longest_cycle(found.model) < cycle_time:
+            session.warn(
+                f"The pilot puts a mode at {mode_band(found.model)[1]:.3g} Hz, too fast for the cycle "
+                f"of {cycle_time * 1000:g} ms; its model is not used, the plan rests on the prior "
+                "model. Friction that holds an axis looks like a stiff spring."
+            )
+            found = replace(found, model=self._setting.model, friction=None)
+        if found.model is not self._setting.model:
+            modes = ", ".join(f"{w / (2 * np.pi):.2f}" for w in undamped_modes(found.model)[0])
+            session.screen.say(f"Resonances found: {modes} Hz." if modes else "The axes are rigid.")
         known = replace(self._setting, model=found.model)
         check_loops(known)
         return found, known
@@ -231,7 +244,7 @@ class FastMeasurement:
     ) -> tuple[PlannedFast, Setting]:
         """Plan the main experiments with what the pilot found, and return what that is."""
         session = self._session
-        found, now_known = self._read(recording)
+        found, now_known = self._read(recording, pilot.cycle_time)
         main = plan_main(
             now_known,
             pilot.cycle_time,
@@ -242,26 +255,26 @@ class FastMeasurement:
             self._offsets,
             session.screen.doing,
         )
+        taken = torques_of(recording.experiments)
         if found.friction is None:
-            main = self._gentler(main, recording, pilot)
+            main = self._gentler(main, taken, pilot)
         main = freed_of_friction(main, now_known, found.noise, found.friction)
+        beside = np.maximum(taken - torques_foreseen(pilot, now_known), 0.0)
+        if found.friction is not None:
+            main = with_room_for_torque(main, now_known, found.noise, beside)
         for note in main.plan.notes:
             session.screen.say(note)
-        main = replace(main, rests_on="pilot's model")
+        if now_known.model is not self._setting.model:
+            main = replace(main, rests_on="pilot's model")
         session.screen.fast_plan(main)
         return main, now_known
 
-    def _gentler(
-        self, main: PlannedFast, recording: Recording, pilot: MultisinePlan
-    ) -> PlannedFast:
+    def _gentler(self, main: PlannedFast, taken: FloatArray, pilot: MultisinePlan) -> PlannedFast:
         """Return a plan that rests on a model which does not explain the pilot, so much weaker.
 
         By what axes' torques were in the pilot, over what that model had foreseen.
         """
-        foreseen = experiment_peaks(pilot, self._setting)[:, TORQUE, :].max(axis=0)
-        done = [e for e in recording.experiments if e.kind == "multisine" and e.complete]
-        taken = np.max([np.abs(e.torque - e.torque.mean(axis=0)).max(axis=0) for e in done], axis=0)
-        more = float(np.max(taken / foreseen))
+        more = float(np.max(taken / torques_foreseen(pilot, self._setting)))
         if more <= 1.0:
             return main
         self._session.warn(

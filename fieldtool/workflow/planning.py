@@ -1,7 +1,7 @@
 """Plan the fast measurement: how long, which lines, how strong, and how well it will tell."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -19,14 +19,11 @@ from fieldtool.experiment.multisine.design import (
     settle_time,
     shortest_period,
     telling_lines,
-    with_bias,
 )
 from fieldtool.experiment.multisine.forecast import forecast_multisine, predicted_phasors
 from fieldtool.experiment.multisine.plan import Lines, MultisinePlan
 from fieldtool.experiment.multisine.unit_inputs import Shape
 from fieldtool.identify.likelihood.expected import Excitation, Expected, Noise, expected_accuracy
-from fieldtool.identify.multisine.dry_friction import DryFriction
-from fieldtool.identify.multisine.pilot import FRICTION_SEEN
 from fieldtool.records.model import MachineModel
 from fieldtool.workflow.best_spread import BestSpread
 
@@ -327,46 +324,6 @@ def _candidate(
     likely = [Excitation(omega, torque, samples) for torque in torques]
     expected = expected_accuracy(setting.model, likely, noise)
     return _Candidate(period, spread, lines, wanted.reached(expected), wanted.mean(expected))
-
-
-def freed_of_friction(
-    planned: PlannedFast, setting: Setting, noise: Noise, friction: DryFriction | None
-) -> PlannedFast:
-    """Return the plan with a bias velocity where dry friction was seen and the travel allows one.
-
-    Otherwise the two amplitude levels (the pilot's and this one's) tell friction from elasticity.
-    """
-    seen = () if friction is None else friction.seen(FRICTION_SEEN)
-    if friction is None or not seen:
-        return planned
-    names = ", ".join(friction.axes[k] for k in seen)
-    biased = with_bias(planned.plan, setting, seen)
-    if biased is not None:
-        plan, factor = biased
-        found = _checked(replace(planned, plan=plan), setting, noise)
-        if found is not None and found.reached <= 1.0:
-            note = (
-                f"{names}: dry friction; a constant velocity is added, so that the axes do not reverse "
-                f"(excitation {100 * factor:.0f} % of what the limits allow)."
-            )
-            return replace(found, plan=replace(plan, notes=(*plan.notes, note)))
-    note = (
-        f"{names}: dry friction, and the travel is too short for a constant velocity that would keep it "
-        "out; it is told from elasticity by two amplitude levels and by the lines between, and what is "
-        "left of it is said."
-    )
-    plan = replace(planned.plan, notes=(*planned.plan.notes, note))
-    return replace(planned, plan=plan)
-
-
-def _checked(planned: PlannedFast, setting: Setting, noise: Noise) -> PlannedFast | None:
-    """Return the plan with its moves and accuracy; None if it would leave a limit."""
-    try:
-        moves = forecast_multisine(planned.plan, setting)
-    except PlanRefusedError:
-        return None
-    accuracy = expected_accuracy(setting.model, excitations(planned.plan, setting), noise)
-    return replace(planned, moves=moves, accuracy=accuracy)
 
 
 def fine_enough(period: float, model: MachineModel) -> bool:

@@ -212,6 +212,27 @@ def test_a_plan_on_a_model_that_does_not_explain_the_pilot_is_weaker(make_bench,
     assert taken["pilot"] < taken["fast"] < 0.9 * 6.0
 
 
+def test_a_pilot_whose_modes_are_too_fast_for_the_cycle_is_not_followed(make_bench, monkeypatch):
+    """Friction that holds an axis looks like a spring a hundred times as stiff."""
+    bench = make_bench(turntable())
+    read_pilot = fast_measuring.read_pilot
+
+    def stiff(recording, prior):
+        found = read_pilot(recording, prior)
+        table, *others = found.model.axes
+        springs = tuple(replace(k, value=300 * k.value) for k in table.springs)
+        model = replace(found.model, axes=(replace(table, springs=springs), *others))
+        return replace(found, model=model)
+
+    monkeypatch.setattr(fast_measuring, "read_pilot", stiff)
+    outcome = fast(bench, "measure")
+    assert outcome.code == 0, outcome.err
+    said = " ".join(outcome.out.split())
+    assert "too fast for the cycle" in said
+    assert "Simulated with the pilot's model" not in said
+    assert "Resonances found" not in said
+
+
 # --- dry friction --------------------------------------------------------------------------------
 
 

@@ -18,11 +18,12 @@ from fieldtool.experiment.multisine.plan import MultisineExperiment
 from fieldtool.experiment.multisine.unit_inputs import Shape
 from fieldtool.identify.likelihood.expected import Noise
 from fieldtool.identify.multisine.dry_friction import DryFriction
+from fieldtool.identify.multisine.pilot import _explaining
 from fieldtool.records.closed_loop import AxisLoop, Biquad
 from fieldtool.records.model import AxisModel, Coupling, Estimate, MachineModel
+from fieldtool.workflow.adapted import freed_of_friction, with_room_for_torque
 from fieldtool.workflow.planning import (
     Wanted,
-    freed_of_friction,
     narrowest_mode,
     plan_main,
     plan_pilot,
@@ -217,3 +218,29 @@ def test_what_is_done_about_friction_is_said(travel: float, word: str) -> None:
     assert any(word in note for note in freed.plan.notes)
     assert bool(np.any(freed.plan.experiments[0].bias)) == (travel > 1)
     assert freed_of_friction(main, where, noise, None) is main
+
+
+def test_friction_and_noise_get_room_beside_the_excitation() -> None:
+    where = setting()
+    noise = Noise(np.full(2, 0.004), np.full(2, 2e-6))
+    main = plan_main(where, CYCLE, noise, timing(where, 12.0), Wanted(), 2)
+    assert with_room_for_torque(main, where, noise, np.zeros(2)) is main
+    beside = np.array([3.6, 0.1])
+    assert main.moves[0].torque + beside[0] > 6.0
+    weaker = with_room_for_torque(main, where, noise, beside)
+    assert weaker.moves[0].torque + beside[0] < 6.0
+    assert weaker.reached > main.reached  # what it will tell is reckoned anew
+    assert any(note.startswith("a: friction and noise") for note in weaker.plan.notes)
+
+
+def test_plans_can_be_made_where_one_axis_alone_shows_noise() -> None:
+    """As told by a pilot in which one axis stuck and slipped, and the other had none at all."""
+    where = setting()
+    size = np.exp(-np.arange(40) / 8.0)
+    response = size[:, None, None] * np.array([[1.0, 0.3], [0.3, 1.0]], complex)
+    scatter = np.random.default_rng(fresh_seed()).uniform(0.5, 2.0)
+    powers = np.abs(response[:, :, 1]) ** 2 * scatter  # the second axis' torque made them all
+    noise = _explaining([(response, powers, 1000)], rounds=3)
+    assert noise.torque[0] < 1e-3 * noise.torque[1]
+    main = plan_main(where, CYCLE, noise, timing(where, 12.0), Wanted(), 2)
+    assert np.all(np.isfinite(main.accuracy.std))

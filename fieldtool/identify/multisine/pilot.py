@@ -249,7 +249,8 @@ def _explaining(seen: Sequence[tuple[ComplexArray, FloatArray, int]], rounds: in
 
     In the first round each counts by itself, which does for means; single powers scatter as much as
     they are large, and then count by what is expected of them (quasi-likelihood: McCullagh and Nelder,
-    Generalized Linear Models, chapter 9).
+    Generalized Linear Models, chapter 9).  No axis' position is taken for surer than LEAST_POWER of its
+    own scatter: torque noise of one axis alone can not make that of all.
     """
     axes = seen[0][0].shape[1]
     rows = np.vstack(
@@ -269,7 +270,9 @@ def _explaining(seen: Sequence[tuple[ComplexArray, FloatArray, int]], rounds: in
         variance = nnls(weighted, power / expected)[0] / scale
         expected = np.maximum(rows @ variance, LEAST_POWER * expected)
     std = np.sqrt(variance)
-    return Noise(torque=std[:axes], position=np.maximum(std[axes:], SMALLEST))
+    own = np.median(np.vstack([one * (samples / 4.0) for _, one, samples in seen]), axis=0)
+    least = np.maximum(np.sqrt(LEAST_POWER * own), SMALLEST)
+    return Noise(torque=std[:axes], position=np.maximum(std[axes:], least))
 
 
 def _fitted(
