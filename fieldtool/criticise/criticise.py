@@ -22,7 +22,7 @@ from fieldtool.criticise.evidence.position import position_error
 from fieldtool.criticise.evidence.spans import Spans
 from fieldtool.criticise.extension import extended_model
 from fieldtool.criticise.numbers import numbers_of
-from fieldtool.criticise.search.afterwards import Accepted
+from fieldtool.criticise.search.afterwards import FALSE_ZERO, Accepted
 from fieldtool.criticise.search.fit import Fitted
 from fieldtool.criticise.search.judge import Parts
 from fieldtool.criticise.search.machine import Machine
@@ -49,8 +49,6 @@ NEAR_NOISE = 1.5
 ENOUGH, ENOUGH_KNOWN, ENOUGH_SURE = 0.9, 0.97, 0.98
 """Share of the explainable error that has to be explained for "explained": where the noise is not known,
 where it is, and where it is and the causes' forms are no approximations."""
-FALSE_ZERO = 3.0
-"""Standard errors of a torque's zero, from which a constant torque is told beside causes."""
 OTHER_UNIT = 5.0
 """Factor between measured and needed torque from which it is no fault of the machine."""
 FLAT = 0.02

@@ -58,6 +58,8 @@ class Effect:
     """Whether couplings pass on what is unknown of it to all axes."""
     exact: ClassVar[bool] = False
     """Whether its form is no approximation of what machines have."""
+    fits: ClassVar[float] = 0.95
+    """Share of what is wrong of its axis that its form explains at least, where it is the only cause."""
 
     axis: int
     parameters: tuple[Parameter, ...]

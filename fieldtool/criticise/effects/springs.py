@@ -79,6 +79,7 @@ class Backlash(SpringEffect):
     source = "Nordin and Gutman, Automatica 38, 2002 (dead zone with a damped contact)"
     signature = "resonances that rise with the amplitude and fall steeply with small ones"
     contrary = "a torque while the axis moves at constant speed; growth with the amplitude"
+    fits = 0.5  # contacts that bounce are sensitive to all that is small
 
     def structure(self, structure: Structure, values: Values) -> Structure:
         """Put the dead zone into the spring."""

@@ -79,6 +79,7 @@ class MeasurementDelay(Effect):
     signature = "a phase in proportion to the frequency, with a gain of one; linear"
     contrary = "harmonics; dependence on amplitude or direction"
     shows = ("own motion",)
+    fits = 0.5  # everything that is sampled has one, whatever else is wrong
 
     def implausible(self, values: Values, context: Context) -> str:
         """Refuse what is small beside a cycle: nobody knows the moments of samples that well."""
@@ -111,6 +112,7 @@ class TorqueSaturation(Effect):
     )
     signature = "an error only where the reported torque is large, of its sign; odd harmonics"
     contrary = "an error at small torques"
+    fits = 0.8  # how round the corner is differs from motor to motor
     shows = ("large torque",)
 
     def reported(self, torque: FloatArray, motion: Motion, values: Values) -> FloatArray:

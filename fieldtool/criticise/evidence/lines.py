@@ -129,6 +129,7 @@ def lines_of(
     top: float,
     structure: Structure,
     unknown: Sequence[FloatArray],
+    named: Sequence[FloatArray] = (),
 ) -> Lines:
     """Find noise and weights of one span.
 
@@ -143,6 +144,8 @@ def lines_of(
         Says what noise of the position does to the torque.
     unknown : sequence of ndarray
         Courses (n, M) of what is not known beforehand.
+    named : sequence of ndarray
+        Courses of what an effect is the cause of, and therefore no noise.
     """
     n, M = span.stop - span.start, motion.position.shape[1]
     taper = np.ones(n) if span.periods else tukey(n, TAPER)
@@ -151,7 +154,7 @@ def lines_of(
     ones = np.ones((count, M))
     low_pass = butter(ORDER, min(CORNER * top * 2 * motion.step, 0.9), output="sos")
     shape = Lines(span, motion, window, ones, low_pass, ones, np.zeros((2 * count * M, 0)))
-    lines = _less(shape, error, unknown)
+    lines = _less(shape, error, (*unknown, *named))
     frequency = np.arange(count) / (n * motion.step)
     white = white_noise(motion.position[span.start : span.stop])
     share = np.mean(window**2, axis=0)

@@ -24,6 +24,7 @@ from fieldtool.criticise.search.rules import (
     LESS_MOVED,
     STAYED,
     Tried,
+    related,
     tolerance,
 )
 from fieldtool.criticise.search.significance import compared
@@ -37,6 +38,13 @@ NEARLY_ALL = 0.95
 FEW_STEPS = 6
 MOST_OF_IT = 0.5
 """Share of what is wrong of an axis, noise taken off, that its causes explain together at least."""
+BESIDE_NOISE, LEFT = 2.25, 5e-3
+"""Power over that of noise, and RMS beyond it over that of the torque, from which something is left."""
+SHOWN_STILL = 0.2
+"""Share of what a cause leaves, that looks as it must look itself, from which its form is another."""
+FRICTION = ("speed", "direction")
+FALSE_ZERO = 3.0
+"""Standard errors with which a torque's zero is known, from which it is not likely."""
 OFF_ZERO = 3.0
 """Standard errors of a torque's zero, from which friction may differ between the directions instead."""
 DIRECTIONS = ("coulomb_friction", "asymmetric_friction")
@@ -270,21 +278,30 @@ def convincing(
     accepted: Sequence[Accepted],
     rejected: Reasons,
 ) -> tuple[Fitted, list[Accepted]]:
-    """Give no name on an axis where all causes together leave more unexplained than they explain.
+    """Give no name on an axis where its causes leave what they should explain.
 
-    Whatever is left there would bend their numbers, and may be what they stand in for.
+    Whatever is left there would bend their numbers, and may be what they stand in for.  All causes
+    together explain most of what is wrong.  A single one explains what its form should, or what it
+    leaves does at least not look as it must look itself.
     """
     kept = list(accepted)
     first = prepared.simulator.parts(before.hypothesis, "unseen")
     there = relative_errors(first)
-    left = relative_errors(prepared.simulator.parts(current.hypothesis, "unseen"))
     for axis in range(there.size):
         noise = relative_noise(first, axis)
-        if noise is None or there[axis] <= noise**2:
-            continue
-        share = (there[axis] - left[axis]) / (there[axis] - noise**2)
         alone = [a for a in kept if a.tried.effect.axis == axis and a.tried.effect.other is None]
-        if share >= MOST_OF_IT or not alone:
+        if noise is None or there[axis] <= noise**2 or not alone:
+            continue
+        last = prepared.simulator.parts(current.hypothesis, "unseen")
+        left, level = relative_errors(last)[axis], relative_noise(last, axis) or noise
+        share = (there[axis] - left) / (there[axis] - noise**2)
+        others = [a for a in kept if axis in _axes_of(a.tried.effect) and a not in alone]
+        single = alone[0].tried.effect if len(alone) == 1 and not others else None
+        poor = single is not None and share < single.fits and left > BESIDE_NOISE * level**2
+        poor = poor and left - level**2 > LEFT**2
+        poor = poor and single is not None and _looks(prepared, current, single)
+        poor = poor or (single is not None and _asks_for_zero(prepared, current, single))
+        if share >= MOST_OF_IT and not poor:
             continue
         for a in alone:
             effect = a.tried.effect
@@ -296,6 +313,27 @@ def convincing(
             less = current.hypothesis.without(place_of(current.hypothesis, effect))
             current = fit(prepared.simulator, less)
     return current, kept
+
+
+def _asks_for_zero(prepared: Prepared, current: Fitted, effect: Effect) -> bool:
+    """Whether dry friction needs a zero of the torque that is not likely: its directions may differ."""
+    if effect.name != DIRECTIONS[0] or effect.location != "motor":
+        return False
+    machine = current.hypothesis.machine
+    name = f"{prepared.recording.names[effect.axis]}.offset"
+    k = machine.names.index(name)
+    zero = machine.variables[k]
+    return abs(float(current.hypothesis.base[k])) > FALSE_ZERO * zero.scale * zero.known
+
+
+def _looks(prepared: Prepared, current: Fitted, effect: Effect) -> bool:
+    """Whether what is left beside a cause looks as it must look itself; an exact form leaves nothing."""
+    if effect.exact or not effect.seen_by:
+        return True
+    # Friction of another form than that of the cause shows in the other one of its views.
+    shown = FRICTION if related(effect.name, "viscous_friction") else effect.seen_by
+    views = views_of(prepared.context(current.hypothesis), effect.axis, shown)
+    return max((v.share for v in views), default=0.0) >= SHOWN_STILL
 
 
 def unharmful(

@@ -201,18 +201,26 @@ def _make_room(kept: dict[bytes, Any], most: int) -> None:
         kept.pop(next(iter(kept)))
 
 
-def _without_unknown(hypothesis: Hypothesis, lines: Lines, values: FloatArray) -> FloatArray:
-    columns = []
-    for effect in hypothesis.effects:
+def unknown_courses(hypothesis: Hypothesis, motion: Motion) -> list[FloatArray]:
+    """Return torques, (n, M) each, of which each experiment has its own size, if it has any."""
+    out = []
+    for effect, values in zip(hypothesis.effects, hypothesis.values, strict=True):
         if effect.name != "periodic_disturbance":
             continue
-        place = hypothesis.effects.index(effect)
-        for course in effect.unknown(lines.motion, hypothesis.values[place]):
-            axes = range(lines.weight.shape[1]) if effect.spreads else (effect.axis,)
+        axes = range(motion.position.shape[1]) if effect.spreads else (effect.axis,)
+        for course in effect.unknown(motion, values):
             for axis in axes:
-                full = np.zeros_like(lines.motion.position)
+                full = np.zeros_like(motion.position)
                 full[:, axis] = course
-                columns.append(lines.projected(flat(lines.raw(full) * lines.weight)))
+                out.append(full)
+    return out
+
+
+def _without_unknown(hypothesis: Hypothesis, lines: Lines, values: FloatArray) -> FloatArray:
+    columns = [
+        lines.projected(flat(lines.raw(full) * lines.weight))
+        for full in unknown_courses(hypothesis, lines.motion)
+    ]
     if not columns:
         return values
     stacked = np.column_stack(columns)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from fieldtool.criticise.effects.base import Context, band_limited
 from fieldtool.criticise.evidence.lines import Lines, lines_of, with_shared_noise
 from fieldtool.criticise.evidence.spans import Spans, spans_of, usable_experiments
-from fieldtool.criticise.search.hypothesis import Hypothesis, Simulator
+from fieldtool.criticise.search.hypothesis import Hypothesis, Simulator, unknown_courses
 from fieldtool.criticise.search.machine import Machine
 from fieldtool.criticise.simulate.inverse import HiddenSystem
 from fieldtool.criticise.simulate.motion import Motion, motions_of
@@ -116,6 +116,7 @@ def reweighted(prepared: Prepared, hypothesis: Hypothesis) -> Prepared:
                 prepared.spans.top,
                 system.structure,
                 _from(free.get(span.experiment, []), span.start, motion.rows),
+                unknown_courses(hypothesis, motion),
             )
         )
     simulator = Simulator(prepared.motions, tuple(with_shared_noise(lines)))

@@ -55,8 +55,11 @@ CLEAR = 0.9
 """Share of what is not explained, from which no other start is tried."""
 ELSEWHERE, ELSEWHERE_LOOSE = 0.01, 0.3
 """Relative change of a mass, spring or coupling, and of a damper or friction, that bends a fit."""
-TRACE = 0.01
-"""Share of the error that a candidate must be expected to explain to be fitted in full."""
+TRACE, TRACE_MORE = 0.01, 0.04
+"""Share of the error that a candidate must be expected to explain to be fitted in full: the first of an
+axis, and a further one, which has to explain more."""
+FAR_BEHIND = 0.3
+"""Of the expected gain of what explains nearly all: with less, a candidate is not fitted beside it."""
 SIMPLER = {"cogging": ("gravity",)}
 """What is the same but for a number that is fixed: a wave of the position of one a turn."""
 Advance = Callable[[str, float], None]
@@ -218,9 +221,12 @@ def _round(
         pool = [e for e in pool if {e.axis, e.other} & active or e.name == "periodic_disturbance"]
         at = tangent(simulator, start)
         ranked = screened(simulator, at, pool, _part(step, number, len(starts)))
-        chosen = _chosen(ranked, at)
+        chosen = _chosen(ranked, at, {a.tried.effect.axis for a in accepted})
         looked += [s.effect for s in ranked]
+        clear = 0.0
         for k, one in enumerate(chosen):
+            if one.gain < FAR_BEHIND * clear and one.effect.name != "measurement_delay":
+                continue
             step((number + SCREENING + (1 - SCREENING) * k / len(chosen)) / len(starts))
             fitted = fit(simulator, _grown(start, one), shared=at.of_machine)
             if one.effect.name == "stiffness_change":
@@ -231,7 +237,9 @@ def _round(
                 continue
             if key not in best or fitted.cost < best[key].fitted.cost:
                 best[key] = judged(simulator, fitted, fitted.hypothesis.effects[-1], unseen)
-        if any(t.share >= CLEAR and t.gain.p <= CHANCE for t in best.values()):
+                if _clear(best[key]):
+                    clear = max(clear, one.gain)
+        if any(_clear(t) for t in best.values()):
             break
     tried = list(best.values())
     good = []
@@ -251,6 +259,11 @@ def _round(
     if accepted:
         return [], looked  # what pairs alone explain is looked for once, before anything has a name
     return _pair(prepared, context, current, accepted, at, chosen[:PAIRED], unseen), looked
+
+
+def _clear(tried: Tried) -> bool:
+    """Whether a candidate explains nearly all that is left, and not by chance."""
+    return tried.share >= CLEAR and tried.gain.p <= CHANCE
 
 
 def _part(step: Callable[[float], None], number: int, starts: int) -> Callable[[float], None]:
@@ -275,10 +288,12 @@ def _why_not(
     return why_not(candidate, context, known, level, further)
 
 
-def _chosen(ranked: Sequence[Screened], at: Tangent) -> list[Screened]:
+def _chosen(ranked: Sequence[Screened], at: Tangent, named: set[int]) -> list[Screened]:
     """Take the best few, with the delay always among them, and the simpler ones that they contain."""
     cost = float(at.side @ at.side)
-    promising = [s for s in ranked if s.gain > TRACE * cost]
+    promising = [
+        s for s in ranked if s.gain > (TRACE_MORE if s.effect.axis in named else TRACE) * cost
+    ]
     chosen = promising[:FULL]
     names = {(n, s.effect.axis) for s in chosen for n in s.effect.replaces}
     axes = {s.effect.axis for s in chosen}
