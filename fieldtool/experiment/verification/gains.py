@@ -116,6 +116,9 @@ class GainEstimate:
         self._squares = self._kept * self._squares + difference**2
         if self._cycles < FEWEST:
             return []
+        if np.all(self._squares < SURE**2 * self._square):  # nothing can be sure of so little
+            self._since[:] = 0
+            return []
         share, sure = self._estimated()
         away = np.maximum(np.abs(share) - SURE * sure, 0.0)
         if not self._tests:
