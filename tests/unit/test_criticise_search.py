@@ -43,8 +43,8 @@ def reference_of(rng, size):
     return np.tile(out, (PERIODS + 2, 1))
 
 
-def recorded(rng, delay):
-    loop = ClosedLoop(MODEL, (AxisLoop(*GAINS), AxisLoop(*GAINS)))
+def recorded(rng, delay, model=MODEL):
+    loop = ClosedLoop(model, (AxisLoop(*GAINS), AxisLoop(*GAINS)))
     experiments = []
     for number in range(4):
         fine = reference_of(rng, 0.02)
