@@ -91,6 +91,7 @@ class Simulator:
         self._kept: dict[bytes, FloatArray] = {}
         self._ready: dict[bytes, Driven] = {}
         self._courses: dict[bytes, FloatArray] = {}
+        self._bases: dict[tuple[Any, ...], FloatArray] = {}
         self._built: tuple[Hypothesis | None, Structure | None] = (None, None)
 
     def errors(self, hypothesis: Hypothesis) -> dict[str, FloatArray]:
@@ -134,8 +135,26 @@ class Simulator:
                 motion = self.motions[name]
                 errors[name] = motion.torque - self.torque(hypothesis, motion)
             values = lines.projected(lines.weighted(errors[name]))
-            out.append((lines, _without_unknown(hypothesis, lines, values)))
+            out.append((lines, values - self._unknown_part(hypothesis, lines, values)))
         return out
+
+    def _unknown_part(
+        self, hypothesis: Hypothesis, lines: Lines, values: FloatArray
+    ) -> FloatArray | float:
+        """Return what torques of a size of their own explain of weighted lines; their basis is kept."""
+        names = [
+            (e.key, tuple(sorted(v.items())))
+            for e, v in zip(hypothesis.effects, hypothesis.values, strict=True)
+            if e.name == "periodic_disturbance"
+        ]
+        if not names:
+            return 0.0
+        key = (self.lines.index(lines), *names)
+        if key not in self._bases:
+            _make_room(self._bases, KEPT)
+            self._bases[key] = _unknown_basis(hypothesis, lines)
+        basis = self._bases[key]
+        return np.asarray(basis @ (basis.T @ values))
 
     def _structure(self, hypothesis: Hypothesis) -> Structure:
         """Return the machine with what effects change of it; the last one is remembered."""
@@ -195,7 +214,7 @@ class Simulator:
         return self._courses[key]
 
 
-def _make_room(kept: dict[bytes, Any], most: int) -> None:
+def _make_room(kept: dict[Any, Any], most: int) -> None:
     """Forget the oldest until one more may be kept."""
     while len(kept) >= most:
         kept.pop(next(iter(kept)))
@@ -216,17 +235,13 @@ def unknown_courses(hypothesis: Hypothesis, motion: Motion) -> list[FloatArray]:
     return out
 
 
-def _without_unknown(hypothesis: Hypothesis, lines: Lines, values: FloatArray) -> FloatArray:
+def _unknown_basis(hypothesis: Hypothesis, lines: Lines) -> FloatArray:
+    """Return orthonormal columns that span the weighted lines of torques of a size of their own."""
     columns = [
         lines.projected(flat(lines.raw(full) * lines.weight))
         for full in unknown_courses(hypothesis, lines.motion)
     ]
-    if not columns:
-        return values
-    stacked = np.column_stack(columns)
+    stacked = np.column_stack(columns) if columns else np.zeros((2 * lines.weight.size, 0))
     size = np.linalg.norm(stacked, axis=0)
-    stacked = stacked[:, size > 0] / size[size > 0]
-    if not stacked.shape[1]:
-        return values
-    q, _ = np.linalg.qr(stacked)
-    return np.asarray(values - q @ (q.T @ values))
+    q, _ = np.linalg.qr(stacked[:, size > 0] / size[size > 0])
+    return np.asarray(q)
