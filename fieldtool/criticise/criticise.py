@@ -49,6 +49,8 @@ NEAR_NOISE = 1.5
 ENOUGH, ENOUGH_KNOWN, ENOUGH_SURE = 0.9, 0.97, 0.98
 """Share of the explainable error that has to be explained for "explained": where the noise is not known,
 where it is, and where it is and the causes' forms are no approximations."""
+STRONG = 0.01
+"""Of the power of the strongest line of a motion: lines that units are judged by."""
 OTHER_UNIT = 5.0
 """Factor between measured and needed torque from which it is no fault of the machine."""
 FLAT = 0.02
@@ -110,6 +112,10 @@ def criticise(
         ) from error
     prepared = found.prepared
     before = _axis_errors(found, found.before)
+    if all(e.hidden for e in before):
+        raise NotEnoughDataError(
+            f"{before[0].sentence}. So it is with all axes: nothing is criticised."
+        )
     after = _axis_errors(found, found.after)
     causes = tuple(_cause(found, a, recording) for a in found.accepted)
     held = _held_out(found)
@@ -227,15 +233,24 @@ def check_units(prepared: Prepared) -> None:
     for k, axis in enumerate(prepared.recording.axes):
         if axis.torque_unit == "A":
             continue  # how many N m an A is, nobody has said
-        measured = needed = 0.0
+        measured = needed = common = 0.0
         for name, motion in prepared.motions.items():
-            rows = motion.counted[:, k] > 0
-            measured += float(np.sum(motion.torque[rows, k] ** 2))
-            needed += float(np.sum(torques[name][rows, k] ** 2))
-        if needed <= 0.0 or measured <= 0.0 or not np.isfinite(needed):
+            moved, torque, wanted = (
+                np.fft.rfft(course[:, k])[1:]
+                for course in (motion.position, motion.torque, torques[name])
+            )
+            # where it hardly moves, its motion is an encoder's steps, differentiated twice
+            power, strong = np.abs(torque) ** 2, np.abs(moved) ** 2
+            strong = strong > STRONG * strong.max(initial=0.0)
+            measured += float(power[strong].sum())
+            needed += float((np.abs(wanted[strong]) ** 2).sum())
+            common += float((torque[strong] * wanted[strong].conj()).sum().real)
+        if needed <= 0.0 or measured <= 0.0 or common <= 0.0 or not np.isfinite(needed):
             continue
-        factor = float(np.sqrt(measured / needed))
-        if not 1 / OTHER_UNIT < factor < OTHER_UNIT:
+        # noise of either alone leaves one of them right
+        factors = np.array([common / needed, measured / common])
+        if np.all(factors > OTHER_UNIT) or np.all(factors < 1 / OTHER_UNIT):
+            factor = float(factors[np.argmin(np.abs(np.log(factors)))])
             raise NotEnoughDataError(
                 f"{axis.name}: its torque is {factor:.2g} times the one that its motion needs by "
                 "the model. No machine changes by that much: the recording and the model are of "

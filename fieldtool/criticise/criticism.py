@@ -67,7 +67,13 @@ class SignalError:
     """RMS of measured minus simulated over RMS of measured, of one axis."""
 
     torque: float
+    """0 where the encoder hides at all frequencies what torque the motion needs."""
     position: float
+
+    @property
+    def told(self) -> float | None:
+        """The torque's, None where nothing can be said of it."""
+        return self.torque or None
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from fieldtool.experiment.axes import Axes
 PROOF_REST = 0.1
 """Seconds in which the axes stand before: what the encoder shows then is its noise."""
 PROOF_WAIT = 2.0
-"""Seconds to wait at most, afterwards, until nothing swings."""
+"""Seconds to wait at most, before until nothing sags, and afterwards until nothing swings."""
 PROOF_QUIET = 0.05
 """Share of what an axis may go astray within which it stands."""
 PROOF_PAUSE = 0.006
@@ -109,7 +109,8 @@ class Proof:
         self._by_offset = bool(axes.torque_offsets) and axes.torque_offsets[k]
         sizes = pulses(axes, k, float(stands[k]), step, self._by_offset)
         self._rest, pause = max(5, ceil(PROOF_REST / step)), max(2, ceil(PROOF_PAUSE / step))
-        self._waits, self._quiet = ceil(PROOF_WAIT / PROOF_REST), quiet
+        self._waits = self._settles = ceil(PROOF_WAIT / PROOF_REST)
+        self._quiet = quiet
         self._held: list[FloatArray] = []
         parts, ends, sign = [np.zeros(self._rest)], [self._rest], 1.0
         for size, rows in sizes:
@@ -140,9 +141,17 @@ class Proof:
         if self._done >= self._path.size or self._too_much():
             self._refuse()
             return None
+        if self._done == self._rest and self._still_sags():
+            self._done, self._resting, self._pulls = 0, [], []
         until = min(self._done + PROOF_SLICE, next(end for end in self._ends if end > self._done))
         part, self._done = self._path[self._done : until], until
         return self._targets(part)
+
+    def _still_sags(self) -> bool:
+        """Whether to wait on before the first pulse: a weight sinks until its loop has taken it over."""
+        self._settles -= 1
+        sags = np.ptp(self._resting) > SHOWN_COUNTS * float(self._axes.counts[self._k])
+        return bool(sags) and self._settles >= 0
 
     def _too_much(self) -> bool:
         """Whether the next pulse, on top of what the axis holds already, is beyond its torque limit."""

@@ -67,7 +67,7 @@ def gain(material: Material) -> Section | None:
     meaning = "An error is the RMS of measured minus simulated over the RMS of measured."
     if not criticism.causes:
         plain = tuple(
-            (name, percent(e.torque), percent(held.noise_floor[name]), percent(e.position))
+            (name, percent(e.told), percent(held.noise_floor[name]), percent(e.position))
             for name, e in held.error_before.items()
         )
         table = Table(("axis", "torque: error", "noise floor", "position: error"), plain)
@@ -75,8 +75,8 @@ def gain(material: Material) -> Section | None:
     rows = tuple(
         (
             name,
-            percent(first.torque),
-            percent(held.error_after[name].torque),
+            percent(first.told),
+            percent(held.error_after[name].told),
             percent(held.noise_floor[name]),
             percent(held.explained.get(name)),
             percent(first.position),

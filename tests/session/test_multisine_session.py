@@ -198,10 +198,11 @@ def test_a_loop_that_becomes_unstable_is_named_and_the_data_are_kept(turntable):
             with pytest.raises((SafetyStopError, LoopUnstableError)) as error:
                 run_multisine(group, plan, axes_of(group, setting), kept.append, told)
         assert turntable.powered() == {}
-        assert [(e.name, e.complete) for e in kept] == [
-            ("multisine 1", True),
-            ("multisine 2", False),
-        ]
+        assert (kept[0].name, kept[0].complete) == ("multisine 1", True)
+        for cut in kept[1:]:  # tried again where it did not come to a steady state
+            assert cut.name.startswith("multisine 2")
+            assert not cut.complete
+        assert len(kept) > 1
         if isinstance(error.value, LoopUnstableError):
             break
         assert "is above the limit" in str(error.value)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from fieldtool.cli.main import main
+from fieldtool.criticise.evidence import lines
 from fieldtool.records.model_file import write_model
 from fieldtool.records.recording import save
 from tests.unit.late_axis import FINE, MODEL, STEP, recorded
@@ -106,6 +107,54 @@ def test_units_that_can_not_be_are_refused_and_get_no_cause(good, criticise, cha
     assert "a unit is wrong" in err
     assert hint in err
     assert err.count("\n") == 1
+
+
+def coarse(e, size=1.0):
+    """An experiment as seen by an encoder of 2500 counts, with all its motions made smaller."""
+    step = 2 * np.pi / 2500
+    position = step * np.round(size * e.position / step)
+    return replace(e, position=position, torque=size * e.torque)
+
+
+def test_a_coarse_encoder_is_no_wrong_unit(good, criticise):
+    """Its steps, differentiated twice, are many times the torque that was measured."""
+    code, _, err = criticise(changed(good, coarse), *criticise.model)
+    assert "a unit is wrong" not in err
+    assert code == 0, err
+
+
+def test_an_axis_that_hardly_counts_is_no_defect(good, criticise):
+    def second(e):
+        small = coarse(e, 0.02)
+        position = np.column_stack([0.02 * e.position[:, 0], small.position[:, 1]])
+        return replace(small, position=position)
+
+    code, _, err = criticise(changed(good, second), *criticise.model)
+    assert code == 0, err
+
+
+def test_where_steps_hide_every_torque_nothing_is_said_of_it(good, criticise, monkeypatch):
+    """All lines of one axis, then of both, have no weight."""
+    weighed = lines._weighed
+
+    def without(axes):
+        def changed_weights(shape, noise):
+            found = weighed(shape, noise)
+            return replace(found, weight=np.where(np.isin([0, 1], axes), 0.0, found.weight))
+
+        return changed_weights
+
+    monkeypatch.setattr(lines, "_weighed", without([0]))
+    code, out, _ = criticise(good, *criticise.model)
+    assert code == 0
+    where = json.loads(out)["criticism"]["where"]
+    assert where[0].startswith("a: nothing can be said of its torque")
+    code, out, _ = criticise(good, *criticise.model[:2])
+    assert "hidden" in out
+    monkeypatch.setattr(lines, "_weighed", without([0, 1]))
+    code, _, err = criticise(good, *criticise.model)
+    assert code == 5
+    assert "So it is with all axes" in err
 
 
 @pytest.mark.parametrize(

@@ -38,6 +38,8 @@ class Motors:
     count: float = COUNT
     gain: float = 2.0
     """N m s/rad, of the velocity loop."""
+    weight: float = 0.0
+    """N m, of which the loops take over more and more: 0.15 s."""
     cycle_time: float = STEP
     asked: bool = False
     """Whether torque offsets were asked for."""
@@ -74,7 +76,8 @@ class Motors:
         torque = np.zeros(2)
         for _ in range(INNER):
             speed = np.where([False, self.stuck], 0.0, self.speed)
-            torque = self.gain * (15.0 * (target - self.position) - speed) + extra
+            sinks = self.weight * np.exp(-self.row * STEP / 0.15)
+            torque = self.gain * (15.0 * (target - self.position) - speed) + extra - sinks
             for k in range(2):
                 if self.speed[k] == 0 and abs(torque[k]) <= self.friction[k]:
                     continue
@@ -125,6 +128,32 @@ def test_a_sound_encoder_answers_whatever_the_friction(fresh_rng, friction, coun
     one = proof(motors, replace(AXES, resolution=np.full(2, count)))
     assert one.answered
     assert motors.most[1] <= max(2.2 * torque, 0.12 * LIMITS.torque) * 1.5
+
+
+@pytest.mark.parametrize("stuck", [False, True])
+def test_a_weight_sinks_until_its_loop_has_taken_it_over(stuck):
+    """Sinking is no noise of the encoder that pulses would have to stand out from."""
+    motors = Motors(weight=0.05, stuck=stuck)
+    if stuck:
+        with pytest.raises(SafetyStopError, match="y: does not move by its encoder"):
+            proof(motors)
+    else:
+        assert proof(motors).answered
+        assert motors.most[1] < 4 * PROOF_SHARES[0] * LIMITS.torque
+
+
+def test_what_goes_to_and_fro_has_moved():
+    """Two counts one way and two the other, of an encoder so coarse that friction hides the rest."""
+    one = Proof(AXES, 1, np.zeros(2), STEP, np.full(2, 1e-4), lambda *_: None)
+    capture, rows_done = None, 0
+    while (targets := one(capture)) is not None and not one.answered:
+        rows, pulse = targets.position.shape[0], targets.torque_offset[:, 1]
+        position = np.stack([np.zeros(rows), 2 * COUNT * np.sign(pulse)], axis=1)
+        torque = targets.torque_offset
+        words = np.zeros((rows, 2), dtype=np.uint16)
+        capture = Capture(rows_done, targets.position, position, torque, words)
+        rows_done += rows
+    assert one.answered
 
 
 def test_the_first_pulses_are_enough_without_friction():

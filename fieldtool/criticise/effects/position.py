@@ -126,7 +126,7 @@ def position_candidates(context: Context) -> list[Effect]:
             (EncoderError, info.position_unit, 0.02 * travel),
         ):
             orders = waves(context, axis, kind is EncoderError)
-            if info.kind == "rotary":
+            if info.kind == "rotary" and travel > 0.0:
                 orders = [*orders, *(o for w in FEW_WAVES if (o := 2 * np.pi * w / travel) > 1.5)]
             for order in orders:
                 low, high = (0.8, 1.25) if order * travel > 2 * np.pi * FEWEST_WAVES else (0.6, 1.6)
@@ -140,6 +140,8 @@ def position_candidates(context: Context) -> list[Effect]:
 def waves(context: Context, axis: int, accelerated: bool) -> list[float]:
     """Orders, 1/rad or 1/m, at which a wave over the position explains most of the error."""
     travel, fastest = context.travel(axis), context.fastest(axis)
+    if travel <= 0.0:
+        return []
     lowest = 2 * np.pi * FEWEST_WAVES / travel
     finest = MOST_ORDERS / FINEST * 2 * np.pi / travel
     highest = min(2 * np.pi * context.top / max(0.1 * fastest, 1e-12), finest)

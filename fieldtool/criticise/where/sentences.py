@@ -45,6 +45,8 @@ class AxisError:
     band: tuple[float, float]
     """Hz: a third-octave band that has most of the error."""
     sentence: str
+    hidden: bool = False
+    """Whether its encoder hides at all frequencies what torque its motion needs."""
 
 
 @dataclass(frozen=True)
@@ -76,6 +78,13 @@ def axis_errors(context: Context, parts: Parts) -> tuple[AxisError, ...]:
         error, noise = relative_error(parts, axis), relative_noise(parts, axis)
         views = views_of(context, axis)
         band = _band(parts, axis)
+        if not any(np.any(lines.weight[:, axis] > 0.0) for lines, _ in parts):
+            sentence = (
+                f"{info.name}: nothing can be said of its torque: at all frequencies its encoder's "
+                "steps or noise hide what torque its motion needs; larger motions would show it"
+            )
+            out.append(AxisError(info.name, error, noise, views, band, sentence, hidden=True))
+            continue
         out.append(
             AxisError(info.name, error, noise, views, band,
                       _sentence(context, parts, axis, error, noise, views, band))
@@ -200,6 +209,8 @@ def _in_time(parts: Parts, axis: int) -> str:
     ordered = sorted(parts, key=lambda p: p[0].motion.clock[p[0].span.start])
     half = len(ordered) // 2
     early, late = relative_error(ordered[:half], axis), relative_error(ordered[half:], axis)
+    if not early or not late:
+        return ""
     if late > CHANGED * early:
         return f", and is {late / early:.1f} times as large in the later half of the data"
     if early > CHANGED * late:

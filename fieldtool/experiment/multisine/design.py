@@ -81,7 +81,7 @@ def fast_cycle_times(model: MachineModel, shortest: float) -> tuple[float, ...]:
     fitting = tuple(t for t in CYCLE_TIMES if shortest - 1e-9 <= t <= needed)
     if not fitting:
         raise PlanRefusedError(
-            f"the fastest mode needs a cycle of {needed * 1000:.2g} ms or less, the bus allows "
+            f"the fastest mode needs a cycle of {needed * 1000:.3g} ms or less, the bus allows "
             f"{shortest * 1000:g} ms or more. Use a higher bit rate, fewer axes on the bus, or a "
             "smaller `shortest_cycle` in the machine profile."
         )
