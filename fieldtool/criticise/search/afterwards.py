@@ -10,6 +10,7 @@ from fieldtool.criticise.effects.friction import friction_candidates
 from fieldtool.criticise.search.fit import EXACTLY, Fitted, fit
 from fieldtool.criticise.search.hypothesis import Hypothesis
 from fieldtool.criticise.search.judge import (
+    at_noise,
     difference,
     explained_share,
     explained_torque,
@@ -89,7 +90,9 @@ def pruned(
             if torque < LEAST_TORQUE:
                 why = "lowers no error on unseen data once the others are there"
             share = explained_share(before, parts, _axes_of(effect))
-            beside = replace(a.tried, gain=gain, torque=torque, share=share)
+            beside = replace(
+                a.tried, gain=gain, torque=torque, share=share, at_noise=at_noise(parts)
+            )
             judged.append((replace(a, tried=beside), less, why))
         worst = min(judged, key=lambda j: j[0].tried.gain.t)
         reason = worst[2]
@@ -165,12 +168,13 @@ def tied(
                 swapped = replace(swapped, base=rival.fitted.hypothesis.base)
             fitted = fit(prepared.simulator, swapped)
             worse = difference(prepared.simulator, fitted, current)
-            enough = tolerance(first.gain)
+            sure = first.surely(rival)
+            enough = tolerance(first.gain, sure)
             if worse.t >= ALIKE_T and worse.before - worse.after > enough:
                 continue
             ahead = replace(first.gain, after=worse.before)
             behind = difference(prepared.simulator, current, fitted)
-            lost = behind.t >= ALIKE_T and behind.before - behind.after > tolerance(ahead)
+            lost = behind.t >= ALIKE_T and behind.before - behind.after > tolerance(ahead, sure)
             if lost and first.effect.name == "measurement_delay":
                 # It went first while other causes were not known, and is not as good beside them.
                 first, current = replace(rival, fitted=fitted, gain=ahead), fitted

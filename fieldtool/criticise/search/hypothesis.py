@@ -44,6 +44,14 @@ class Hypothesis:
             f"{names[e.axis]}.{what}" for e in self.effects for what in e.replaces
         ) & frozenset(self.machine.names)
 
+    @cached_property
+    def structure(self) -> Structure:
+        """The machine with what effects change of it."""
+        structure = Structure.of(self.machine.with_values(self.base))
+        for effect, values in zip(self.effects, self.values, strict=True):
+            structure = effect.structure(structure, values)
+        return structure
+
     def with_effect(self, effect: Effect) -> "Hypothesis":
         """Add one effect at its start values; what it contains goes."""
         alike = [e for e in self.effects if e.name == effect.name and e.key[:4] == effect.key[:4]]
@@ -92,7 +100,6 @@ class Simulator:
         self._ready: dict[bytes, Driven] = {}
         self._courses: dict[bytes, FloatArray] = {}
         self._bases: dict[tuple[Any, ...], FloatArray] = {}
-        self._built: tuple[Hypothesis | None, Structure | None] = (None, None)
 
     def errors(self, hypothesis: Hypothesis) -> dict[str, FloatArray]:
         """Return the torque measured less simulated, (n, M), by experiment."""
@@ -107,7 +114,7 @@ class Simulator:
             if other is not moved:
                 moves += repr((effect.key, sorted(values.items())))
                 moved = other
-        structure = self._structure(hypothesis).between(*motion.clock[[0, -1]])
+        structure = hypothesis.structure.between(*motion.clock[[0, -1]])
         needed = self._remembered(moves.encode(), structure, moved).copy()
         for effect, values in pairs:
             besides = effect.torque(moved, values)
@@ -155,16 +162,6 @@ class Simulator:
             self._bases[key] = _unknown_basis(hypothesis, lines)
         basis = self._bases[key]
         return np.asarray(basis @ (basis.T @ values))
-
-    def _structure(self, hypothesis: Hypothesis) -> Structure:
-        """Return the machine with what effects change of it; the last one is remembered."""
-        known, structure = self._built
-        if structure is None or known is not hypothesis:
-            structure = Structure.of(hypothesis.machine.with_values(hypothesis.base))
-            for effect, values in zip(hypothesis.effects, hypothesis.values, strict=True):
-                structure = effect.structure(structure, values)
-            self._built = hypothesis, structure
-        return structure
 
     def _remembered(self, moves: bytes, structure: Structure, motion: Motion) -> FloatArray:
         key = moves + b"|" + structure.key

@@ -14,6 +14,8 @@ from fieldtool.criticise.search.significance import Comparison, compared
 
 FloatArray = NDArray[np.float64]
 Parts = Sequence[tuple[Lines, FloatArray]]
+AT_NOISE = 2.0
+"""Power of errors over that of noise, up to which they are noise."""
 UNSURE_NOISE = 0.25
 """Of the power of an error, that may be noise though the estimate of the noise is smaller."""
 
@@ -29,6 +31,16 @@ def judged(simulator: Simulator, fitted: Fitted, effect: Effect, before: Parts) 
         explained_share(before, after, axes),
         explained_torque(before, after, effect.axis),
         beyond_noise(before, axes),
+        at_noise(after),
+    )
+
+
+def at_noise(parts: Parts) -> bool:
+    """Whether the noise is known and there is nothing else."""
+    axes = range(parts[0][0].weight.shape[1]) if parts else range(0)
+    known = all(lines.span.periods > 1 for lines, _ in parts)
+    return known and all(
+        axis_power(parts, axis) <= AT_NOISE * expected_noise(parts, axis) for axis in axes
     )
 
 

@@ -117,9 +117,7 @@ def _tried(
 def _lines(
     simulator: Simulator, hypothesis: Hypothesis, side: FloatArray, basis: FloatArray, mode: Effect
 ) -> _Sought:
-    structure = Structure.of(hypothesis.machine.with_values(hypothesis.base))
-    for effect, values in zip(hypothesis.effects, hypothesis.values, strict=True):
-        structure = effect.structure(structure, values)
+    structure = hypothesis.structure
     ends = structure.motors if mode.location == "motor" else structure.ends
     dof = int(ends[mode.axis])
     parts, row = [], 0

@@ -12,7 +12,6 @@ from fieldtool.criticise.search.hypothesis import Hypothesis, Simulator, unknown
 from fieldtool.criticise.search.machine import Machine
 from fieldtool.criticise.simulate.inverse import HiddenSystem
 from fieldtool.criticise.simulate.motion import Motion, motions_of
-from fieldtool.criticise.simulate.structure import Structure
 from fieldtool.errors import NotEnoughDataError
 from fieldtool.records.model import MachineModel
 from fieldtool.records.recording import AxisInfo, Recording
@@ -99,8 +98,7 @@ def prepare(recording: Recording, model: MachineModel, contiguous: bool = False)
 
 def reweighted(prepared: Prepared, hypothesis: Hypothesis) -> Prepared:
     """Return the same with the noise that is left by a hypothesis."""
-    model = hypothesis.machine.with_values(hypothesis.base)
-    system = HiddenSystem.of(Structure.of(model))
+    system = HiddenSystem.of(hypothesis.structure)
     errors = prepared.simulator.errors(hypothesis)
     free: dict[str, list[FloatArray]] = {}
     lines: list[Lines] = []

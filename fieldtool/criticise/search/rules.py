@@ -33,6 +33,8 @@ ALIKE_SHARE = 0.025
 """Of what is explained: forms of effects are not so sure that less would tell rivals apart."""
 ALIKE_LEFT = 0.5
 """Of what the better of two rivals leaves: who leaves so much more is no rival, however little it is."""
+ALIKE_LEFT_SURE = 0.05
+"""The same where both forms are exact and no more than noise is left."""
 STAYED, LESS_MOVED = 1e-3, 4.0
 """Sum of squares of the machine's relative changes that says nothing; ratio of two that does."""
 FAMILIES = (
@@ -83,10 +85,13 @@ def related(one: str, other: str) -> bool:
     return one == other or any({one, other} <= family for family in FAMILIES)
 
 
-def tolerance(gain: Comparison) -> float:
-    """Return by how much more a rival may leave than a cause of this gain, and be as good."""
+def tolerance(gain: Comparison, sure: bool = False) -> float:
+    """Return by how much more a rival may leave than a cause of this gain, and be as good.
+
+    ``sure``: the forms of both are exact, and what the better one leaves is noise.
+    """
     explained = max(gain.before - gain.after, 0.0)
-    return min(ALIKE_SHARE * explained, ALIKE_LEFT * gain.after)
+    return min(ALIKE_SHARE * explained, (ALIKE_LEFT_SURE if sure else ALIKE_LEFT) * gain.after)
 
 
 @dataclass(frozen=True)
@@ -102,6 +107,13 @@ class Tried:
     """RMS of what it explains over that of the axis' torque."""
     beyond: float
     """Power of the axis' error before, over that of the noise; infinite where it is not known."""
+
+    at_noise: bool = False
+    """Whether what is left on unseen data is known to be no more than noise."""
+
+    def surely(self, other: "Tried") -> bool:
+        """Whether small differences between two count: exact forms, and nothing else that is left."""
+        return self.effect.exact and other.effect.exact and self.at_noise
 
     @property
     def place(self) -> int:

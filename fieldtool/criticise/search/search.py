@@ -327,7 +327,7 @@ def _winner(prepared: Prepared, tried: Sequence[Tried], rejected: Reasons) -> Ac
         if (
             other.effect.name == "measurement_delay"
             and other.effect.axis == best.effect.axis
-            and (alike or lost < tolerance(best.gain))
+            and (alike or lost < tolerance(best.gain, best.surely(other)))
         ):
             best = other
         elif contained and (
