@@ -36,6 +36,12 @@ _SYNTAX: tuple[tuple[str, str], ...] = (
     ),
 )
 """Part of a parser's complaint, and what it means."""
+_OCTAL = re.compile(r"[-+]?0[0-7_]+")
+_PATTERNS = {
+    r"^[A-Za-z][A-Za-z0-9_-]{0,31}$": "is a letter, then up to 31 letters, digits, _ or -, none with "
+    "accents",
+}
+"""Regular expressions of values that a person writes, in words."""
 LONGEST_NUMBER = 1000
 """Bits of a whole number that is shown; Python refuses to write very long ones out."""
 LONGEST_TEXT = 60
@@ -48,6 +54,24 @@ def syntax_words(problem: str | None) -> str:
         if problem and theirs in problem:
             return ours
     return problem or "it can not be read"
+
+
+def misread(text: str) -> str:
+    """Return why a bare number of YAML 1.1 is not the one that its writer means; empty where it is.
+
+    Parameters
+    ----------
+    text
+        As it stands in the file, without quotes, where YAML takes it for a number.
+    """
+    if ":" in text:
+        return f"{text} would be read to the base of 60: write the number out, or text in quotes"
+    if _OCTAL.fullmatch(text) and int(text, 8) != int(text):
+        return (
+            f"{text} would be read to the base of 8: leave the leading 0 away (and if it stands behind "
+            "a comma, write the number with a point)"
+        )
+    return ""
 
 
 def place_words(place: Place, data: Any) -> str:
@@ -110,6 +134,8 @@ def problem_words(error: Mapping[str, Any]) -> str:
         return f"text belongs here{shown} (put it in quotes if it is to be text)"
     if kind in ("model_type", "dict_type", "model_attributes_type"):
         return f"keys with values belong here, one a line and indented{shown}"
+    if kind == "string_pattern_mismatch" and limits.get("pattern") in _PATTERNS:
+        return f"{_PATTERNS[limits['pattern']]}{shown}"
     if kind in ("too_long", "too_short"):
         return _count_words(limits)
     if kind == "literal_error":

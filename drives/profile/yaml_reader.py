@@ -6,7 +6,7 @@ from typing import Any
 import yaml
 
 from drives.errors import ProfileError
-from drives.profile.plain_words import syntax_words
+from drives.profile.plain_words import misread, syntax_words
 
 MAX_PROFILE_BYTES = 1_000_000
 MAX_DEPTH = 30
@@ -38,8 +38,8 @@ def read_yaml(path: Path, largest: int = MAX_PROFILE_BYTES) -> tuple[Any, Lines]
     Raises
     ------
     ProfileError
-        If the file can not be read, is too large, is no YAML, uses aliases, has a key twice, or is
-        no mapping.
+        If the file can not be read, is too large, is no YAML, uses aliases, has a key twice or a
+        number that YAML reads otherwise than it looks, or is no mapping.
     """
     try:
         size = path.stat().st_size
@@ -104,3 +104,5 @@ def _note_lines(node: yaml.Node, place: tuple[str | int, ...], lines: Lines, pat
     elif isinstance(node, yaml.SequenceNode):
         for k, value in enumerate(node.value):
             _note_lines(value, (*place, k), lines, path)
+    elif node.tag.endswith((":int", ":float")) and (why := misread(node.value)):
+        raise ProfileError(path, why, node.start_mark.line + 1)

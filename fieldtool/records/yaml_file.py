@@ -10,7 +10,7 @@ from typing import Annotated, Any, TypeVar
 import yaml
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
-from drives.profile.plain_words import place_words, problem_words, syntax_words
+from drives.profile.plain_words import misread, place_words, problem_words, syntax_words
 from fieldtool.errors import FileFormatError
 from fieldtool.records.files import MEBIBYTE, read_text, write_atomic
 
@@ -48,8 +48,9 @@ def read_checked(path: Path | str, schema: type[Model]) -> tuple[Model, Mapping[
     Raises
     ------
     FileFormatError
-        With the line of the first fault: not YAML, an alias, a double or unknown key, a missing
-        key, a value of the wrong type or outside its range.
+        With the line of the first fault: not YAML, an alias, a double or unknown key, a number
+        that YAML reads otherwise than it looks, a missing key, a value of the wrong type or outside
+        its range.
     """
     text = read_text(path, MAX_BYTES)
     data, lines = _parse(Path(path), text)
@@ -165,3 +166,5 @@ def _collect_lines(path: Path, node: yaml.Node, where: Path_, lines: dict[Path_,
             seen.add(key.value)
             lines[*where, key.value] = line
             _collect_lines(path, item, (*where, key.value), lines)
+    elif node.tag.endswith((":int", ":float")) and (why := misread(node.value)):
+        raise FileFormatError(path, f"{why}.", node.start_mark.line + 1)

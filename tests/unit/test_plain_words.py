@@ -43,6 +43,10 @@ PROGRAMMERS = (
         ("name: m\n", "name m\n", 3, "a key needs a colon"),
         ("[0.02, 0.025]", "[0.02, -1]", 16, "axis table, prior.masses, number 2: has to be above 0"),
         ("drive: reference", "drive: [1]", 8, "axis table, drive: text belongs here"),
+        ("node_id: 11", "node_id: 011", 7, "011 would be read to the base of 8"),
+        ("[0.02, 0.025]", "[0.02, 1:30]", 16, "1:30 would be read to the base of 60"),
+        ("[0.02, 0.025]", "[0.02, 1:30.5]", 16, "1:30.5 would be read to the base of 60"),
+        ("name: table", "name: größe", 5, "axis größe, name: is a letter, then up to 31 letters"),
     ],
 )  # fmt: skip
 def test_a_fault_is_said_in_plain_words_with_its_line(tmp_path, old, new, line, said):
