@@ -59,7 +59,7 @@ class Axis:
     load: float = 0.4 * INERTIA
     spring: float = 0.4 * INERTIA * (2 * np.pi * 15.0) ** 2
 
-    def run(self, targets, noise=0.0, seed=0, count=COUNT):
+    def run(self, targets, noise=0.0, seed=0, count=COUNT, step=STEP):
         """Return positions and torques as they are told at each SYNC, (n,) each."""
         rng = np.random.default_rng(seed)
         motor, loop = INERTIA - self.load, self.loop
@@ -69,11 +69,12 @@ class Axis:
         told = []
         for target in targets.tolist():
             told.append((round(q1 / count) * count, torque + noise * rng.standard_normal()))
-            speed, bend = (target - last) / STEP, (target - 2 * last + before) / STEP**2
-            for k in range(8):
+            speed, bend = (target - last) / step, (target - 2 * last + before) / step**2
+            loops = round(step / PERIOD)
+            for k in range(loops):
                 position = round(q1 / count) * count
                 velocity, seen = (position - seen) / PERIOD, position
-                reference = last + (target - last) * k / 8
+                reference = last + (target - last) * k / loops
                 error = loop.position_p * (reference - position) + speed - velocity
                 wanted = loop.velocity_p * error + integral + loop.inertia_ff * bend
                 integral += loop.velocity_i * PERIOD * error
@@ -111,22 +112,22 @@ def drive(loop, **changes):
     return replace(one, **changes)
 
 
-def trial_path(loop, count=COUNT, hold=100):
-    answer = first_answer([drive(loop)], count, LIMITS, 0.5, STEP)
-    u = np.arange(200) * STEP / 0.2
+def trial_path(loop, count=COUNT, hold=100, step=STEP):
+    answer = first_answer([drive(loop)], count, LIMITS, 0.5, step)
+    u = np.arange(round(0.2 / step)) * step / 0.2
     nudge = np.round(0.01 * u**3 * (10 - 15 * u + 6 * u * u) / count) * count
     return np.concatenate(
         [np.zeros(hold), answer, np.zeros(120), nudge, nudge[-1] - nudge, np.zeros(50)]
     ), hold
 
 
-def watch(loop, learned=None, noise=0.0, encoder=None, **changes):
+def watch(loop, learned=None, noise=0.0, encoder=None, step=STEP, **changes):
     if encoder is not None:
         changes["noise"] = encoder
     quanta = np.array([max(noise, 0.01)])
     if learned is None:
         learned = Learned(np.array([2 * noise]), np.array([0.3]), np.zeros(1))
-    return IdentityWatch([drive(loop, **changes)], STEP, quanta, learned, ["N m"])
+    return IdentityWatch([drive(loop, **changes)], step, quanta, learned, ["N m"])
 
 
 def first_alarm(one, position, torque, target):
@@ -191,15 +192,22 @@ HIDDEN = {
 }
 
 
+@pytest.mark.parametrize(("step", "slower"), [(STEP, 1.0), (4e-3, 0.25), (5e-3, 0.2)])
 @pytest.mark.parametrize("name", HIDDEN)
-def test_gains_that_feed_forward_hides_are_named_with_their_factor(name):
+def test_gains_that_feed_forward_hides_are_named_with_their_factor(name, step, slower):
     """Feed-forward moves the axis nearly by itself, so torques are nearly as they should be."""
     factor, changes = HIDDEN[name]
-    held = replace(GOOD, **{key: by * getattr(GOOD, key) for key, by in changes.items()})
+    loop = replace(
+        GOOD,
+        position_p=slower * GOOD.position_p,
+        velocity_p=slower * GOOD.velocity_p,
+        velocity_i=slower**2 * GOOD.velocity_i,
+    )
+    held = replace(loop, **{key: by * getattr(loop, key) for key, by in changes.items()})
     fine = COUNT / 16
-    target, _ = trial_path(GOOD, fine)
-    position, torque = Axis(held).run(target, 0.02, 3, fine)
-    one = watch(GOOD, noise=0.02, encoder=drive(GOOD).noise / 16)
+    target, _ = trial_path(loop, fine, step=step)
+    position, torque = Axis(held).run(target, 0.02, 3, fine, step)
+    one = watch(loop, noise=0.02, encoder=drive(loop).noise / 16, step=step)
     said = [
         text
         for q, t, r in zip(position, torque, target, strict=True)

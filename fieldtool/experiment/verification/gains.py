@@ -21,10 +21,10 @@ import numpy as np
 
 from fieldtool.records.model import FloatArray
 
-REMEMBERED = 0.03
-"""s, time constant with which cycles are forgotten."""
+REMEMBERED, REMEMBERED_CYCLES = 0.03, 15.0
+"""s, and cycles at least, with which cycles are forgotten (time constants)."""
 FEWEST = 12.0
-"""Cycles that are remembered, at least."""
+"""Cycles that have to be remembered before anything is said; fewer than REMEMBERED_CYCLES."""
 FED_OFF, LATE_OFF, ANY_OFF = 0.3, 0.05, 100.0
 """Standard deviations before anything is seen: of the share of what is fed forward; of being late, in
 cycles, besides what is known; and of the gains' shares."""
@@ -76,7 +76,8 @@ class GainEstimate:
         self._square = np.maximum(noise**2 + (STEPS * encoder) ** 2, TINY)
         shares = np.stack([np.ones(m), position, np.ones(m)])
         self._unclear = (np.array(CLEAR)[:, None] * shares * encoder) ** 2
-        self._kept, self._tests = exp(-step / REMEMBERED), off is not None
+        self._kept = exp(-min(step / REMEMBERED, 1.0 / REMEMBERED_CYCLES))
+        self._tests = off is not None
         self.off: FloatArray = np.zeros((len(NAMES), m))
         """Largest shares that were surely off so far, shape (3, M)."""
         learned = np.zeros((len(NAMES), m)) if off is None else off
