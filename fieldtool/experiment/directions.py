@@ -61,8 +61,9 @@ CHECK_STARTED = 0.02
 LONGEST_MOVE = 600.0
 """Seconds that crossing the travel may take at most."""
 HELD_BY_FRICTION = (
-    "Its encoder counts, as pulses of torque showed before: friction holds it against its loops. Raise "
-    "its gains position_p, velocity_p and velocity_i, or see whether its brake drags."
+    "Its encoder counts, as pulses of torque showed before: friction holds it against its loops, or "
+    "they are too slow for this move. Raise its gains position_p, velocity_p and velocity_i, or see "
+    "whether its brake drags."
 )
 HELD_BY_ANYTHING = "Is it blocked or its brake closed, or does the encoder not count?"
 PUSH_FACTOR = 4.0

@@ -145,8 +145,9 @@ def check_distortion(distortion: Sequence[AxisDistortion]) -> None:
             raise NotEnoughDataError(
                 f"axis {one.axis} is strongly non-linear: {parity} distortion of "
                 f"{20 * np.log10(share):.0f} dB of its torque (limit "
-                f"{20 * np.log10(ERROR_SHARE):.0f} dB), likely friction or backlash; measure with a "
-                "larger amplitude or on top of a constant velocity, and check the axis for play."
+                f"{20 * np.log10(ERROR_SHARE):.0f} dB): friction, backlash, or an encoder whose "
+                "counts are coarse for so small a motion; measure with a larger amplitude (wider "
+                "limits) or on top of a constant velocity, and check the axis for play."
             )
 
 

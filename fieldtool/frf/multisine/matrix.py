@@ -180,8 +180,14 @@ def solve_set(members: Sequence[LinePhasors], axes: tuple[str, ...]) -> SetRespo
             covariances.append(solved[1])
             freedoms.append(min(float(one.freedom[line - 1]) for one in there))
     if not rows:
+        names = ", ".join(one.name for one in members)
+        if M == 1:
+            raise NotEnoughDataError(
+                f"{names}: none of {everywhere.size} excited lines stands out of the noise, or of the "
+                "encoder's counts; raise the amplitude (wider limits), or measure more periods."
+            )
         raise NotEnoughDataError(
-            f"experiments {', '.join(one.name for one in members)}: at none of {everywhere.size} "
+            f"experiments {names}: at none of {everywhere.size} "
             f"excited lines do {M} of them stand out of the noise in different directions; raise the "
             "amplitude, measure more periods, or drive all axes at the same lines."
         )
