@@ -21,7 +21,9 @@ from fieldtool.criticise.search.machine import Variable
 from fieldtool.criticise.search.prepare import Prepared
 from fieldtool.criticise.search.rules import (
     ALIKE_T,
+    BESIDE_NOISE,
     LEAST_TORQUE,
+    LEFT,
     LESS_MOVED,
     STAYED,
     Tried,
@@ -39,8 +41,6 @@ NEARLY_ALL = 0.95
 FEW_STEPS = 6
 MOST_OF_IT = 0.5
 """Share of what is wrong of an axis, noise taken off, that its causes explain together at least."""
-BESIDE_NOISE, LEFT = 2.25, 5e-3
-"""Power over that of noise, and RMS beyond it over that of the torque, from which something is left."""
 SHOWN_STILL = 0.2
 """Share of what a cause leaves, that looks as it must look itself, from which its form is another."""
 FRICTION = ("speed", "direction")
@@ -153,7 +153,7 @@ def tied(
     """
     if "asymmetric_friction" not in without:
         current, accepted = with_directions(prepared, current, accepted)
-    out: list[Accepted] = []
+    simulator, out = prepared.simulator, list[Accepted]()
     named = {a.tried.effect.key for a in accepted}
     for a in accepted:
         first, ties = a.tried, [t for t in a.ties if _of_directions(a.tried, t)]
@@ -167,9 +167,12 @@ def tied(
             if len(rival.fitted.hypothesis.effects) == len(swapped.effects):
                 swapped = replace(swapped, base=rival.fitted.hypothesis.base)
             fitted = fit(prepared.simulator, swapped)
-            worse = difference(prepared.simulator, fitted, current)
-            sure = first.surely(rival)
+            clean = any(
+                at_noise(simulator.parts(f.hypothesis, "unseen")) for f in (fitted, current)
+            )
+            sure = clean and first.effect.exact and rival.effect.exact
             enough = tolerance(first.gain, sure)
+            worse = difference(prepared.simulator, fitted, current)
             if worse.t >= ALIKE_T and worse.before - worse.after > enough:
                 continue
             ahead = replace(first.gain, after=worse.before)

@@ -9,13 +9,12 @@ from fieldtool.criticise.effects.base import Effect
 from fieldtool.criticise.evidence.lines import Lines
 from fieldtool.criticise.search.fit import Fitted
 from fieldtool.criticise.search.hypothesis import Simulator
-from fieldtool.criticise.search.rules import Tried
+from fieldtool.criticise.search.rules import BESIDE_NOISE, LEFT, Tried
 from fieldtool.criticise.search.significance import Comparison, compared
+from fieldtool.criticise.where.sentences import relative_noise
 
 FloatArray = NDArray[np.float64]
 Parts = Sequence[tuple[Lines, FloatArray]]
-AT_NOISE = 2.0
-"""Power of errors over that of noise, up to which they are noise."""
 UNSURE_NOISE = 0.25
 """Of the power of an error, that may be noise though the estimate of the noise is smaller."""
 
@@ -36,12 +35,13 @@ def judged(simulator: Simulator, fitted: Fitted, effect: Effect, before: Parts) 
 
 
 def at_noise(parts: Parts) -> bool:
-    """Whether the noise is known and there is nothing else."""
-    axes = range(parts[0][0].weight.shape[1]) if parts else range(0)
-    known = all(lines.span.periods > 1 for lines, _ in parts)
-    return known and all(
-        axis_power(parts, axis) <= AT_NOISE * expected_noise(parts, axis) for axis in axes
-    )
+    """Whether the noise is known, and nothing else is left that would tell two exact forms wrongly."""
+    lost = relative_errors(parts)
+    for axis, error in enumerate(lost):
+        noise = relative_noise(parts, axis)
+        if noise is None or error > max(BESIDE_NOISE * noise**2, noise**2 + LEFT**2):
+            return False
+    return True
 
 
 def explained_share(before: Parts, after: Parts, axes: Sequence[int]) -> float:

@@ -33,8 +33,10 @@ ALIKE_SHARE = 0.025
 """Of what is explained: forms of effects are not so sure that less would tell rivals apart."""
 ALIKE_LEFT = 0.5
 """Of what the better of two rivals leaves: who leaves so much more is no rival, however little it is."""
+BESIDE_NOISE, LEFT = 2.25, 5e-3
+"""Power over that of noise, and RMS beyond it over that of the torque, from which something is left."""
 ALIKE_LEFT_SURE = 0.05
-"""The same where both forms are exact and no more than noise is left."""
+"""As :data:`ALIKE_LEFT`, where both forms are exact and no more than noise is left."""
 STAYED, LESS_MOVED = 1e-3, 4.0
 """Sum of squares of the machine's relative changes that says nothing; ratio of two that does."""
 FAMILIES = (
