@@ -218,6 +218,23 @@ def test_gains_that_feed_forward_hides_are_named_with_their_factor(name, step, s
     assert float(told[-1].split(" is ")[1].split()[0]) == pytest.approx(factor, rel=0.4, abs=0.3)
 
 
+def test_the_noise_of_the_first_torque_is_no_wrong_gain():
+    """All later ones are told against it, so it is no noise that comes anew with each cycle."""
+    fine, said = COUNT / 4096, []
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        way = rng.uniform(30, 3000) * fine * rng.choice([-1, 1])
+        creeps = 1 - np.exp(-np.arange(80) * STEP / rng.uniform(0.01, 0.1))
+        target, noise = np.round(way * creeps / fine) * fine, rng.uniform(0.05, 0.5)
+        position, torque = Axis(GOOD).run(target, noise, seed, fine)
+        loop = drive(GOOD, noise=drive(GOOD).noise / 4096)
+        learned = Learned(np.array([4 * noise]), np.array([0.3]), np.zeros(1))
+        one = IdentityWatch([loop], STEP, np.array([0.1 * noise]), learned, ["N m"])
+        for q, t, r in zip(position, torque, target, strict=True):
+            said += [text for _, text in one.take([q], [t], [r], [0.0], fresh=True)]
+    assert not said
+
+
 def test_what_comes_again_and_again_for_a_sample_is_seen_and_a_single_one_is_not():
     """Gains a hundred times too high answer each count of the encoder for a sample or two."""
     still, told = np.zeros(400), np.zeros(400)

@@ -2,11 +2,12 @@
 
 The torque that a controller should give is a sum of parts: what its position gain makes of the distance
 from the reference, what its velocity gain makes of the velocity's error, and what is fed forward.  The
-difference of told and expected torque is explained by shares of these parts, and by being late::
+difference of told and expected torque is explained by shares of these parts, by being late, and by the
+noise of the one torque from which slow ones are left out, which fades as they do::
 
-    told - expected = a position + b velocity + c fed forward + t d(expected)/dt + noise
+    told - expected = a position + b velocity + c fed forward + t d(expected)/dt + s fading + noise
 
-by least squares over the last cycles (forgotten exponentially), with prior knowledge of c and t
+by least squares over the last cycles (forgotten exponentially), with prior knowledge of c, t and s
 (Gaussian: Bishop 2006, equations 3.53 and 3.54).  1 + a and 1 + b are the factors.  Both at once, a = b,
 is a test of its own: gains that are wrong together may show before they can be told apart.
 
@@ -25,9 +26,10 @@ REMEMBERED, REMEMBERED_CYCLES = 0.03, 15.0
 """s, and cycles at least, with which cycles are forgotten (time constants)."""
 FEWEST = 12.0
 """Cycles that have to be remembered before anything is said; fewer than REMEMBERED_CYCLES."""
-FED_OFF, LATE_OFF, ANY_OFF = 0.3, 0.05, 100.0
+FED_OFF, LATE_OFF, ANY_OFF, BEGUN_OFF = 0.3, 0.05, 100.0, 30.0
 """Standard deviations before anything is seen: of the share of what is fed forward; of being late, in
-cycles, besides what is known; and of the gains' shares."""
+cycles, besides what is known; of the gains' shares; and of the first torque, times what is noise at
+least."""
 OFF, SURE = 0.35, 5.0
 """Share by which a gain may be off, and standard deviations by which it has to be farther off."""
 STEPS, CLEAR = 0.7, (0.8, 2.5, 0.8)
@@ -59,6 +61,8 @@ class GainEstimate:
         s, by which torques may be late, standard deviation, shape (M,).
     step
         Cycle time, s.
+    fades
+        Share of a torque that stands still, that is left of it after a cycle.
     off
         Shares that were surely off with the old parameters, shape (3, M); None: those are tried now.
     """
@@ -70,6 +74,7 @@ class GainEstimate:
         position: FloatArray,
         late: FloatArray,
         step: float,
+        fades: float,
         off: FloatArray | None = None,
     ) -> None:
         m = noise.size
@@ -82,18 +87,21 @@ class GainEstimate:
         """Largest shares that were surely off so far, shape (3, M)."""
         learned = np.zeros((len(NAMES), m)) if off is None else off
         self._allowed = np.where(learned > MOST_LEARNED, np.inf, np.maximum(OFF, LEARNED * learned))
-        prior = np.array([ANY_OFF, ANY_OFF, FED_OFF, 1.0])
-        self._prior = np.zeros((m, 4, 4))
-        self._prior[:, range(4), range(4)] = prior**-2
-        self._prior[:, 3, 3] = (LATE_OFF + late / step) ** -2
+        prior = np.tile([ANY_OFF, ANY_OFF, FED_OFF, 1.0, 1.0], (m, 1))
+        prior[:, 3] = LATE_OFF + late / step
+        prior[:, 4] = BEGUN_OFF * np.sqrt(self._square)
+        self._prior = np.zeros((m, 5, 5))
+        self._prior[:, range(5), range(5)] = prior**-2
         # position and velocity gain by one factor
-        self._together = np.array([[1.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+        self._together = np.concatenate([np.eye(4)[:1], np.eye(4)])
+        self._fades = fades
         self.begin()
 
     def begin(self) -> None:
         """Forget what was seen."""
         m = self._square.size
-        self._normal, self._base = np.zeros((m, 4, 4)), np.zeros((m, 4))
+        self._normal, self._base = np.zeros((m, 5, 5)), np.zeros((m, 5))
+        self._begun = 1.0
         self._cycles, self._squares = 0.0, np.zeros(m)
         self._since = np.zeros((len(NAMES), m), dtype=np.int64)
 
@@ -108,7 +116,8 @@ class GainEstimate:
         difference
             Told less expected torque, shape (M,).
         """
-        columns = parts.T
+        columns = np.column_stack([parts.T, np.full(difference.size, self._begun)])
+        self._begun *= self._fades
         self._normal *= self._kept
         self._base *= self._kept
         self._normal += columns[:, :, None] * columns[:, None, :]
@@ -148,7 +157,7 @@ class GainEstimate:
         return share, np.where(hidden, np.inf, np.sqrt(variance * (1 + left / self._square)))
 
     def _left(self, shares: FloatArray) -> FloatArray:
-        """Return the mean square of what shares, (M, 4), leave of the difference, shape (M,)."""
+        """Return the mean square of what shares, (M, 5), leave of the difference, shape (M,)."""
         squares = self._squares - 2 * (shares * self._base).sum(axis=1)
         squares += np.einsum("mi,mij,mj->m", shares, self._normal, shares)
         left: FloatArray = np.maximum(squares, 0.0) / (self._cycles - len(self._prior[0]))

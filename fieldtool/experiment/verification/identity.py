@@ -117,6 +117,7 @@ class IdentityWatch:
             np.array([loop.loop.position_p * self._step for loop in loops]),
             self._late[1],
             self._step,
+            self._passed,
             None if learned is None else learned.gains,
         )
         if learned is not None:
