@@ -19,7 +19,7 @@ from canopen.objectdictionary import (
 )
 
 from drives.errors import ProfileError
-from drives.objects import DATA_TYPES, DataType, ObjectAddress, ObjectInfo
+from drives.objects import DATA_TYPES, DataType, ObjectAddress, ObjectInfo, type_range
 
 MAX_EDS_BYTES = 5_000_000
 """The largest files of real drives have about 1 MB."""
@@ -148,6 +148,22 @@ def info_at(dictionary: ObjectDictionary, address: ObjectAddress) -> ObjectInfo 
     if variable is None or variable.data_type not in TYPE_OF_CODE:
         return None
     return ObjectInfo(address, TYPE_OF_CODE[variable.data_type], variable.name)
+
+
+def range_at(dictionary: ObjectDictionary | None, info: ObjectInfo) -> tuple[int, int] | None:
+    """Return smallest and largest whole number that an entry takes, by its type and its limits.
+
+    None if it holds no whole numbers.  Limits that leave nothing are no limits.
+    """
+    try:
+        low, high = type_range(info.type)
+    except ValueError:
+        return None
+    variable = None if dictionary is None else variable_at(dictionary, info.address)
+    told = (None, None) if variable is None else (variable.min, variable.max)
+    least = low if told[0] is None else max(low, int(told[0]))
+    most = high if told[1] is None else min(high, int(told[1]))
+    return (least, most) if least < most else (low, high)
 
 
 def default_at(dictionary: ObjectDictionary, address: ObjectAddress) -> int | None:

@@ -194,6 +194,11 @@ def _tuning(result: _Result, response: str) -> Tuning:
             parameters = {n: v for n, v in side.present.items() if n in parameters}
         reason = KEPT if k in kept else _reason(task, k, servo)
         axes.append(AxisTuning(side.axis, parameters, axis.margins.sensitivity_peak, reason))
+        if k not in kept and (most := side.largest(parameters)):
+            notes.append(
+                f"{side.axis}: the largest that its drive holds: {', '.join(most)}. More would serve: "
+                "choose other units or ranges in the drive."
+            )
         if side.missing:
             notes.append(
                 f"{side.axis}: its drive profile has no {', '.join(side.missing)} that can be written; "

@@ -114,6 +114,15 @@ class DriveSide:
             if not low <= parameters[name] <= high
         ]
 
+    def largest(self, parameters: Mapping[str, float]) -> list[str]:
+        """Return gains and inertia fed forward that are the most that the drive holds, a phrase each."""
+        return [
+            f"{name} {parameters[name]:.4g}"
+            for name in (*GAINS, "inertia_ff")
+            if name in parameters and name in self.holds
+            if parameters[name] >= (1 - 1e-6) * self.holds[name].bounds[1]
+        ]
+
     def servo(self, parameters: Mapping[str, float]) -> Servo:
         """Return the controller that parameters make of this drive.
 

@@ -11,9 +11,10 @@ import numpy as np
 from drives.canopen_drive.conversion import Conversion
 from drives.canopen_drive.group import profile_of
 from drives.errors import NotSupportedError, ProfileError
-from drives.objects import ObjectAddress, type_range
+from drives.objects import ObjectAddress, ObjectInfo
 from drives.parameters import DriveBackup, load_backup
 from drives.profile import UNKNOWN, AxisProfile, DriveProfile, MachineProfile
+from drives.profile.eds import range_at, read_eds
 from fieldtool.design.drive_side import GAINS, DriveSide, Hold
 from fieldtool.design.moves import JERK_SHARE, SHORTEST_JERK, TestMove, typical_move
 from fieldtool.design.servo import CAUTIOUS_LAG, CAUTIOUS_PERIOD, Timing
@@ -235,7 +236,8 @@ def _present(
 def _holds(
     profile: DriveProfile, conversion: Conversion, present: Mapping[str, float]
 ) -> dict[str, Hold]:
-    """Return how the drive holds each parameter whose unit is known."""
+    """Return how the drive holds parameters of known units: within their types and the EDS' limits."""
+    dictionary = None if profile.eds_path is None else read_eds(profile.eds_path)
     holds = {}
     others = dict(present)
     for name, parameter in profile.parameters.items():
@@ -247,9 +249,10 @@ def _holds(
         scale = conversion.physical(name, 1, others)
         if not (isfinite(scale) and scale > 0):
             continue
-        whole = not parameter.type.startswith("REAL")
-        if whole:
-            low, high = (float(n) for n in type_range(parameter.type))
+        taken = range_at(dictionary, ObjectInfo(parameter.object, parameter.type, name))
+        whole = taken is not None
+        if taken is not None:
+            low, high = (float(n) for n in taken)
         else:
             high = REAL_LARGEST[parameter.type]
             low = -high

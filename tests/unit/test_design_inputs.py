@@ -12,7 +12,7 @@ from drives.errors import ProfileError
 from drives.parameters import back_up, planned_changes, read_loop, save_backup
 from drives.profile import load_machine
 from fieldtool.cli.main import main
-from fieldtool.design.drive_side import DriveSide
+from fieldtool.design.drive_side import GAINS, DriveSide
 from fieldtool.design.rule import DesignError
 from fieldtool.records.model_file import write_model
 from fieldtool.records.recording import save
@@ -67,6 +67,21 @@ def test_present_parameters_are_those_that_the_drive_tells(
             for change in planned_changes(drive, {k: v for k, v in held.items() if k in wanted}):
                 if change.name in held:
                     assert change.after == pytest.approx(held[change.name], rel=1e-6)
+
+
+@pytest.mark.parametrize("wanted", [1e-7, 1e12])
+def test_a_design_stays_within_what_the_drive_takes(tmp_path: Path, wanted: float) -> None:
+    kinds = ("reference", "epos4")
+    folder = session(tmp_path, kinds)
+    machine = machine_of(kinds, tmp_path)
+    with simulated(machine), connect(machine) as group:
+        for side, drive in zip(drive_sides(folder, machine, 0.004), group.drives, strict=True):
+            others = [n for n in ("velocity_ff", "filter1_frequency") if n in side.holds]
+            held = side.held(dict.fromkeys((*GAINS, *others), wanted))
+            for change in planned_changes(drive, held):
+                drive.write(
+                    change.info, change.after_raw
+                )  # the drive refuses what is out of its range
 
 
 def test_without_a_backup_the_design_stands_and_says_so(tmp_path: Path) -> None:
