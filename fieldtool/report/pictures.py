@@ -106,7 +106,7 @@ class _Curves:
         grid, size = self._grid, self._model[:, i, j]
         if self._prior is not None:
             plot.loglog(grid, self._prior[:, i, j], color=PRIOR, lw=1.2, label="prior model")
-        if self._band is not None:
+        if self._band is not None and np.any(size > 0):  # there is no band about nothing
             factor = np.exp(np.minimum(CONFIDENCE * self._band[:, i, j], WIDEST))
             plot.fill_between(
                 grid,

@@ -65,21 +65,32 @@ def free_move(drive: CanopenDrive, typical: TestMove) -> TestMove:
     return replace(typical, distance=sign * way, band=band)
 
 
-def takes_too_much(setting: Setting, k: int, predictions: Sequence[Prediction]) -> bool:
-    """Return whether an axis' move comes too near to a limit by one of these predictions."""
-    limits = setting.limits[k]
+def takes_too_much(
+    setting: Setting, k: int, predictions: Sequence[Prediction]
+) -> tuple[float, str]:
+    """Return how many times what is allowed an axis' move takes by these predictions, and of what.
+
+    The limit that it comes nearest to; 1 and no words where all are kept.
+    """
+    limits, rotary = setting.limits[k], setting.model.axes[k].kind == "rotary"
+    length = "rad" if rotary else "m"
+    most, words = 1.0, ""
     for prediction in predictions:
         one = prediction.axes[k]
         if one.curves is None or one.move is None:
             continue
         speed = float(np.abs(np.gradient(one.curves.position, one.curves.time)).max())
-        if (
-            one.peak_torque > KEPT * limits.torque
-            or one.move.following_error > KEPT * limits.following_error
-            or speed > KEPT * limits.velocity
+        for what, value, limit, unit in (
+            ("torque", one.peak_torque, limits.torque, "N m" if rotary else "N"),
+            ("following error", one.move.following_error, limits.following_error, length),
+            ("velocity", speed, limits.velocity, f"{length}/s"),
         ):
-            return True
-    return False
+            if value > most * KEPT * limit:
+                most = value / (KEPT * limit)
+                words = (
+                    f"{one.axis}: {what} {value:.3g} {unit}, {KEPT * limit:.3g} {unit} is allowed"
+                )
+    return most, words
 
 
 def trial_move(

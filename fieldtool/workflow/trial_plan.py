@@ -163,23 +163,18 @@ def plan_trial(
         check_stable(after, bound)
         check_as_designed(after, stated, designed)
         over = [takes_too_much(setting, k, (before, after)) for k in range(len(moves))]
-        if not any(over):
+        if not any(words for _, words in over):
             break
         moves = tuple(
-            replace(
-                move,
-                velocity=move.velocity * GENTLER,
-                acceleration=move.acceleration * GENTLER**2,
-                jerk=move.jerk * GENTLER**3,
-            )
-            if hard
-            else move
-            for move, hard in zip(moves, over, strict=True)
+            _gentler(move, min(GENTLER, share**-0.5)) if words else move
+            for move, (share, words) in zip(moves, over, strict=True)
         )
     else:
         raise PlanRefusedError(
-            "no move can be found that keeps all limits with the old and the new parameters; nothing "
-            "was moved or written. Widen the limits if the machine allows it, or use --no-verify."
+            "no move can be found that keeps all limits with the old and the new parameters, though it "
+            f"was made slower {TIMES} times ({'; '.join(words for _, words in over if words)}). "
+            "Nothing was moved or written. Widen the limits if the machine allows it, or use "
+            "--no-verify."
         )
     limits = torque_limits(setting.limits)
     steps = [
@@ -209,6 +204,15 @@ def plan_trial(
         notes,
     )
     return _with_excitation(plan, group, setting, steps)
+
+
+def _gentler(move: TestMove, factor: float) -> TestMove:
+    return replace(
+        move,
+        velocity=move.velocity * factor,
+        acceleration=move.acceleration * factor**2,
+        jerk=move.jerk * factor**3,
+    )
 
 
 def _answer(
