@@ -65,14 +65,15 @@ class TrialGuards:
         limits = torque_limits(axes.limits)
         inertia = np.zeros(limits.size) if axes.inertia is None else axes.inertia
         known = old.rest, axes.counts, limits, quanta, inertia / self._step**2, axes.units
-        missing = self._works.most(WorkWatch(*known))
+        missing = self._works.most(WorkWatch(*known, unsure=old.unsure))
         if missing > MOST_MISSING:
             self._warn(
                 "whether motors push the way that they are asked to is hardly told: with the old "
                 f"parameters {missing:.3g} times as much work was missing as is usual. Swings, ways and "
                 "torques are watched as ever."
             )
-        return Guards(self._identity, WorkWatch(*known, min(missing, MOST_MISSING)))
+        watch = WorkWatch(*known, min(missing, MOST_MISSING), old.unsure)
+        return Guards(self._identity, watch)
 
     def without_feed_forward(self, servos: Sequence[Servo]) -> None:
         """Go on with controllers whose feed-forward is switched off, where it can be."""

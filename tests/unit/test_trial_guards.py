@@ -404,6 +404,16 @@ def test_a_first_answer_keeps_following_error_and_velocity(error, velocity):
     assert np.abs(np.diff(kept)).max(initial=0.0) <= 0.8 * velocity * STEP * (1 + 1e-9)
 
 
+@pytest.mark.parametrize("unsure", [0.0, 0.15])
+def test_a_torque_at_rest_that_was_told_of_a_creeping_axis_is_no_reversed_motor(unsure):
+    """Told as -0.12 while the integrator still unwound; now the axis coasts back without any."""
+    known = (np.array([one]) for one in (-0.12, COUNT, LIMIT, 1e-3, INERTIA / STEP**2))
+    one = WorkWatch(*known, ["rad"], unsure=np.array([unsure]))
+    position = np.round(np.linspace(40, 20, 400)) * COUNT
+    found = [one.take([q], [0.01], fresh=True) for q in position.tolist()]
+    assert any(found) == (unsure == 0)
+
+
 def test_a_lost_sample_ends_what_is_reckoned_of_work():
     work = WorkWatch(
         *(np.array([one]) for one in (0.0, COUNT, LIMIT, 1e-3 * LIMIT, INERTIA / STEP**2)), ["rad"]

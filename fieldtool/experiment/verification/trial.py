@@ -70,6 +70,8 @@ class Tried:
     """Peak-to-peak torque of each axis while all stood still, shape (M,)."""
     rest: FloatArray
     """Torque of each axis where it began, once all have come back there and rest, shape (M,)."""
+    unsure: FloatArray
+    """By how much that was another one shortly before, or after drives were enabled anew, shape (M,)."""
     sags: FloatArray
     """How far each axis went as it was enabled, while it was told to stand, shape (M,)."""
 
@@ -191,9 +193,12 @@ def run_trial(
         keep(experiment)
     noise = np.max([np.ptp(rest.torque[rest.rows // 2 :], axis=0) for rest in rests], axis=0)
     last = next((one.torque for one in reversed(kept) if one.kind == "moves"), rests[0].torque)
-    rest = last[-round(REST_TIME / trial.cycle_time) :].mean(axis=0)
+    rows = round(REST_TIME / trial.cycle_time)
+    rest, earlier = last[-rows:].mean(axis=0), last[-2 * rows : -rows]
+    others = [rests[-1].torque[rests[-1].rows // 2 :], *([earlier] if earlier.size else [])]
+    unsure = np.max([np.abs(one.mean(axis=0) - rest) for one in others], axis=0)
     sagged = np.abs(rests[0].position - rests[0].position_reference).max(axis=0)
-    return Tried(tuple(kept), noise, rest, sagged)
+    return Tried(tuple(kept), noise, rest, unsure, sagged)
 
 
 def _named(plan: MultisinePlan, name: str) -> MultisinePlan:

@@ -86,6 +86,8 @@ class WorkWatch:
         Of positions, one an axis, for messages.
     missing
         Largest share of what is usually allowed that was missing with the old parameters.
+    unsure
+        By how much torques at rest may be others besides: an axis that still crept, say; shape (M,).
     """
 
     def __init__(
@@ -97,12 +99,13 @@ class WorkWatch:
         speeds: FloatArray,
         units: Sequence[str] = (),
         missing: float = 0.0,
+        unsure: FloatArray | float = 0.0,
     ) -> None:
         self._scale = max(1.0, LEARNED * missing)
         self._rest, self._counts = rest, counts
         self._units = [(one, TORQUE_UNITS.get(one, "")) for one in units or [""] * rest.size]
         self._speeds = speeds
-        self._unsure = UNSURE * limits + STEPS * quanta
+        self._unsure = UNSURE * limits + STEPS * quanta + unsure
         self.begin()
 
     def begin(self, *, moves: bool = False) -> None:
