@@ -2,7 +2,9 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from mmap import ACCESS_READ, mmap
 from pathlib import Path
+from struct import Struct
 from typing import Any
 
 import h5py
@@ -17,6 +19,10 @@ DAMAGED = (OSError, RuntimeError, KeyError, TypeError, OverflowError, UnicodeErr
 """What h5py raises where a file's inner structure is not whole."""
 MAX_VALUES = 500_000_000
 """Most values in one dataset that are read: 4 GB of float64."""
+_HEAP, _HEAP_HEAD = b"GCOL\1\0\0\0", 16
+"""How a global heap begins: signature, version, nothing; and bytes until its first entry."""
+_ENTRY = Struct("<H6xQ")
+"""Number, 0 for free room, and size."""
 
 
 class MemoryFile:
@@ -126,6 +132,42 @@ def _is_text(value: object) -> bool:
     return isinstance(value, str) and not any("\ud800" <= c <= "\udfff" for c in value)
 
 
+def _check_heaps(path: Path) -> None:
+    """Refuse a file that would never let the HDF5 library go: free room of no size in a global heap.
+
+    The library walks a heap by the sizes that stand in it (HDF5 file format, III.E "Global Heap").
+
+    Raises
+    ------
+    FileFormatError
+        If there is such a heap, or the file can not be read.
+    """
+    try:
+        with path.open("rb") as file, mmap(file.fileno(), 0, access=ACCESS_READ) as data:
+            at = data.find(_HEAP)
+            while at >= 0:
+                if _goes_round(data, at):
+                    raise FileFormatError(path, f"is damaged (a heap without end at byte {at}).")
+                at = data.find(_HEAP, at + 1)
+    except OSError as error:
+        raise FileFormatError(path, f"can not be read ({error.strerror}).") from error
+
+
+def _goes_round(data: mmap, at: int) -> bool:
+    """Whether who walks the heap that begins here would stand still."""
+    if at + _HEAP_HEAD > len(data):
+        return False
+    end = min(at + int.from_bytes(data[at + 8 : at + 16], "little"), len(data))
+    at += _HEAP_HEAD
+    while at + _ENTRY.size <= end:
+        number, size = _ENTRY.unpack_from(data, at)
+        step = size if number == 0 else _ENTRY.size + (size + 7) // 8 * 8
+        if step == 0:
+            return True
+        at += step
+    return False
+
+
 @contextmanager
 def opened(path: Path | str, file_format: str) -> Iterator[Reader]:
     """Open ``path`` for reading and check what it says it is.
@@ -136,7 +178,8 @@ def opened(path: Path | str, file_format: str) -> Iterator[Reader]:
         If it is no HDF5 file or its attribute ``format`` is not ``file_format``.
     """
     path = Path(path)
-    check_size(path, MAX_BYTES)
+    if check_size(path, MAX_BYTES):
+        _check_heaps(path)
     try:
         file = h5py.File(path, "r")
     except OSError as error:

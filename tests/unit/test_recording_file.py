@@ -181,6 +181,21 @@ def test_a_full_disk_keeps_the_old_file_and_the_experiment(
     assert len(load(path).experiments) == 2
 
 
+def test_a_heap_without_end_is_refused_and_holds_nobody_up(tmp_path: Path) -> None:
+    """Free room of no size: the HDF5 library would walk round in it for ever."""
+    path = tmp_path / "r.h5"
+    save(random_recording(5), path)
+    content = bytearray(path.read_bytes())
+    at = content.index(b"GCOL") + 16
+    while int.from_bytes(content[at : at + 2], "little"):
+        size = int.from_bytes(content[at + 8 : at + 16], "little")
+        at += 16 + (size + 7) // 8 * 8
+    content[at + 8 : at + 16] = bytes(8)
+    path.write_bytes(content)
+    with pytest.raises(FileFormatError, match=r"is damaged .*heap without end at byte"):
+        load(path)
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="needs a limit on the size of files")
 def test_a_limit_on_the_size_of_files_is_a_clear_error(tmp_path: Path) -> None:
     script = f"""
