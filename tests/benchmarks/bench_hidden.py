@@ -51,6 +51,8 @@ FEW = {"one": 19, "none": 4, "two": 4, "removed": 4, "size": 0, "time": 1}
 SIZES = (4.0, 2.0, 8.0, 1.0)
 """Times the noise floor, in the order in which all effects are tried at each."""
 EFFECTS = tuple(MAKERS)
+SMALL = tuple(e for e in EFFECTS if e != "measurement_delay")
+"""Effects that can be as small as is wanted: the plant's shortest delay is far above the noise."""
 TOLD = 3
 """Of so many cases with one effect, one is fitted with the structure told as well."""
 
@@ -150,7 +152,8 @@ def case_of(kind, number, seed, effect=None, draw=draw):
     if kind == "removed":
         return judged(kind, draw(seed, (name,)), frozenset({name}))
     if kind == "size":
-        size = SIZES[(number if effect else number // len(EFFECTS)) % len(SIZES)]
+        name = effect or SMALL[number % len(SMALL)]
+        size = SIZES[(number if effect else number // len(SMALL)) % len(SIZES)]
         return judged(kind, draw(seed, (name,), size))
     return timed(seed)
 
