@@ -7,6 +7,18 @@ From Python::
     result.model.axes[0].masses
 """
 
-from fieldtool.workflow import Options, SessionResult, run
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from fieldtool.workflow import Options, SessionResult, run
 
 __all__ = ["Options", "SessionResult", "run"]
+
+
+def __getattr__(name: str) -> Any:
+    """Load the tool when it is first asked for: Ctrl-C while it loads is the command line's to tell."""
+    if name not in __all__:
+        raise AttributeError(f"module 'fieldtool' has no attribute {name!r}")
+    from fieldtool import workflow
+
+    return getattr(workflow, name)

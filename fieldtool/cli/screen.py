@@ -235,7 +235,7 @@ def _what_runs(progress: Progress | MultisineProgress) -> str:
 def expected_text(expected: Expected) -> str:
     """Return the accuracy to expect as one sentence: the worst of each kind, 95 %."""
     parts = [
-        f"{plural} within {percent:.2g} %"
+        f"{plural} within {f'{percent:.2g}' if percent < 99.5 else f'{percent:.0f}'} %"
         for kind, plural in (
             ("mass", "masses"),
             ("spring", "springs"),

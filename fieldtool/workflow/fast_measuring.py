@@ -38,7 +38,13 @@ from fieldtool.workflow.planning import (
     timing,
     usual_seconds,
 )
-from fieldtool.workflow.preparation import axes_of, recording_header, setting_of, window_notes
+from fieldtool.workflow.preparation import (
+    axes_of,
+    check_seen,
+    recording_header,
+    setting_of,
+    window_notes,
+)
 from fieldtool.workflow.rescued import keeping
 from fieldtool.workflow.session import Options, Screen, Session
 from fieldtool.workflow.stopped import check_loops, judge_stop
@@ -106,6 +112,8 @@ def planned_before(
     pilot = plan_pilot(setting, cycle_time, times, SEED, offsets)
     guess = _guessed_noise(group)
     main = plan_main(setting, cycle_time, guess, times, Wanted(), SEED + 1, offsets, advance)
+    for drive, move in zip(group.drives, main.moves, strict=True):
+        check_seen(drive, move.excursion, "the excitation")
     return replace(main, pilot=pilot), pilot
 
 

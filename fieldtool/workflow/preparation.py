@@ -9,6 +9,7 @@ from drives.canopen_drive import CanopenDrive, CanopenGroup
 from drives.canopen_drive.settings import following_error_window
 from drives.parameters import read_loop
 from drives.profile import MachineProfile
+from fieldtool.errors import PlanRefusedError
 from fieldtool.experiment.axes import Axes
 from fieldtool.experiment.forecast import Setting
 from fieldtool.experiment.multisine.unit_inputs import smooth
@@ -16,6 +17,9 @@ from fieldtool.frf.held_targets import LINEAR_TARGETS
 from fieldtool.records.closed_loop import AxisLoop, loop_from_parameters
 from fieldtool.records.model import MachineModel
 from fieldtool.records.recording import AxisInfo, Controller, Recording
+
+SEEN_COUNTS = 4
+"""Counts of its encoder that an axis has to move in any motion that is to tell something."""
 
 
 def setting_of(machine: MachineProfile, group: CanopenGroup, model: MachineModel) -> Setting:
@@ -41,6 +45,25 @@ def _within_window(drive: CanopenDrive, loop: AxisLoop) -> AxisLimits:
         min(limits.velocity, window * loop.position_p) if loop.position_p else limits.velocity
     )
     return replace(limits, following_error=window, velocity=velocity)
+
+
+def check_seen(drive: CanopenDrive, way: float, what: str) -> None:
+    """Refuse a motion that its encoder would hardly see.
+
+    Raises
+    ------
+    PlanRefusedError
+        If it is shorter than SEEN_COUNTS of the encoder.
+    """
+    count = abs(drive.scaling.position)
+    if way < SEEN_COUNTS * count:
+        unit = drive.position_unit
+        raise PlanRefusedError(
+            f"{drive.axis}: within its limits {what} can be {way:.2g} {unit} at most, its encoder "
+            f"counts {count:.2g} {unit}: less than {SEEN_COUNTS} counts tell nothing. Nothing was "
+            "moved. Widen travel, velocity, acceleration, torque or following_error in the machine "
+            "profile, as far as the machine allows."
+        )
 
 
 def window_notes(group: CanopenGroup, setting: Setting) -> tuple[str, ...]:

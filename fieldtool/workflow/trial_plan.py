@@ -25,6 +25,7 @@ from fieldtool.experiment.verification.trial import Trial
 from fieldtool.records.closed_loop import AxisLoop
 from fieldtool.records.model import FloatArray
 from fieldtool.workflow.design_inputs import moves_of, timing_of
+from fieldtool.workflow.preparation import check_seen
 from fieldtool.workflow.trial_checks import check_a_count, check_as_designed, check_stable
 from fieldtool.workflow.trial_loops import answer_torque, drive_loop, first_answer
 from fieldtool.workflow.trial_moves import MOST, free_move, takes_too_much, trial_move
@@ -176,6 +177,8 @@ def plan_trial(
             "Nothing was moved or written. Widen the limits if the machine allows it, or use "
             "--no-verify."
         )
+    for drive, move in zip(group.drives, moves, strict=True):
+        check_seen(drive, abs(move.distance), "the trial's move")
     limits = torque_limits(setting.limits)
     steps = [
         max(torque_steps(drive, servo, cycle) for servo in (old[k], new[k]))

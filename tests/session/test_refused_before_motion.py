@@ -381,6 +381,20 @@ def test_a_limit_that_makes_every_move_last_for_hours_is_refused(make_bench, pro
     nothing_was_done(bench)
 
 
+@pytest.mark.parametrize(
+    "changes", [{"travel": ["-1e-5 deg", "1e-5 deg"]}, {"acceleration": "1e-5 rad/s2"}]
+)
+def test_limits_that_leave_less_than_the_encoder_counts_are_refused(
+    make_bench, profile_of_two, changes
+):
+    bench = limits_changed(make_bench, profile_of_two, changes)
+    outcome = bench.measure("--time", "10", plan="fast")
+    assert outcome.code == 3, outcome.err
+    assert "table: within its limits the excitation can be " in outcome.err
+    assert "counts tell nothing" in outcome.err
+    nothing_was_done(bench)
+
+
 _RANDOM = st.tuples(
     st.floats(-3, 9),  # travel, decades of rad
     st.floats(-1, 1),  # where its middle is, in halves of it

@@ -148,3 +148,21 @@ def test_an_output_that_is_closed_ends_the_command_as_a_stop_does(tmp_path, word
     assert (
         ended.stderr.decode().strip() == "fieldtool: the output was closed before its end: stopped."
     )
+
+
+def test_nothing_heavy_is_loaded_before_a_stop_can_be_told():
+    """Ctrl-C in the first second ends with one sentence: what takes that second is loaded inside."""
+    script = "import sys, fieldtool.cli; print({'numpy', 'can', 'typer'} & set(sys.modules))"
+    ended = subprocess.run(
+        [sys.executable, "-c", script], check=True, capture_output=True, text=True
+    )
+    assert ended.stdout.strip() == "set()"
+
+
+def test_the_python_interface_is_what_the_package_names():
+    import fieldtool
+
+    assert fieldtool.run is import_module("fieldtool.workflow").run
+    assert all(hasattr(fieldtool, name) for name in fieldtool.__all__)
+    with pytest.raises(AttributeError, match="has no attribute 'walk'"):
+        getattr(fieldtool, "walk")  # noqa: B009
