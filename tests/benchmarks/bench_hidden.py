@@ -135,7 +135,7 @@ def kept(keep):
         path = keep / f"{name}.pkl"
         if not path.is_file():
             path.write_bytes(pickle.dumps(draw(seed, effects, wanted)))
-        return pickle.loads(path.read_bytes())  # noqa: S301 - it wrote it itself
+        return pickle.loads(path.read_bytes())
 
     return drawn
 
