@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from fieldtool.criticise.criticise import criticise
+from fieldtool.criticise.search.hypothesis import Simulator
+from fieldtool.criticise.search.prepare import prepare
 from fieldtool.errors import NotEnoughDataError
 from fieldtool.records.closed_loop import AxisLoop, ClosedLoop
 from fieldtool.records.model import AxisModel, Coupling, Estimate, MachineModel
@@ -97,3 +99,16 @@ def test_a_model_of_other_axes_is_refused(fresh_rng):
     other = replace(MODEL, axes=(MODEL.axes[0],), couplings=())
     with pytest.raises(NotEnoughDataError, match="same axes in the same order"):
         criticise(recorded(fresh_rng, 0.0), other)
+
+
+def test_a_hypothesis_whose_hidden_masses_run_away_is_worse_than_any(fresh_rng, monkeypatch):
+    """No error of the program: what it tries on its way may be no machine that can stand."""
+    prepared = prepare(recorded(fresh_rng, 0.0), MODEL)
+    simulator, start = prepared.simulator, prepared.start
+    assert np.all(np.isfinite(simulator.residual(start, "fit")))
+    quiet = Simulator._free_motions
+    monkeypatch.setattr(Simulator, "_free_motions", lambda *a: 1e200 * np.exp(quiet(*a)))
+    again = Simulator(simulator.motions, simulator.lines)
+    with np.errstate(all="ignore"):
+        values = again.residual(start, "fit")
+        assert not np.isfinite(values @ values)

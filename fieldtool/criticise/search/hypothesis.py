@@ -192,6 +192,8 @@ class Simulator:
         columns = (courses[:, : counted.shape[0]] * counted).reshape(courses.shape[0], -1)
         side = ((motion.torque[some] - needed[some]) * counted).ravel()
         size = np.linalg.norm(columns, axis=1)
+        if not np.all(np.isfinite(size)):  # what it rings on as grows beyond all bounds
+            return np.full_like(needed, np.inf)
         size[size == 0.0] = 1.0
         columns /= size[:, None]
         start = np.zeros((1, driven.system.rates.shape[0]))
