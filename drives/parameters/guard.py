@@ -54,6 +54,17 @@ def check_disabled(drives: Iterable[ParameterDrive]) -> None:
             )
 
 
+def other_number(part: Recorded, drive: ParameterDrive) -> tuple[str, int, int] | None:
+    """Return name, recorded and present value of the first number by which it is another drive."""
+    now = drive.identity
+    numbers = (
+        ("vendor-ID", part.vendor_id, now.vendor_id),
+        ("product code", part.product_code, now.product_code),
+        ("serial number", part.serial_number, now.serial_number),
+    )
+    return next((one for one in numbers if one[1] != one[2]), None)
+
+
 def check_same_drives(
     drives: Sequence[ParameterDrive],
     recorded: Sequence[Recorded],
@@ -87,18 +98,16 @@ def check_same_drives(
                 f"the {what} holds axis {part.axis}, which this machine does not have; its axes are "
                 f"{', '.join(by_axis)}."
             )
-        identity = drive.identity
-        for number, was, now in (
-            ("node id", part.node_id, drive.node_id),
-            ("vendor-ID", part.vendor_id, identity.vendor_id),
-            ("product code", part.product_code, identity.product_code),
-            ("serial number", part.serial_number, identity.serial_number),
-        ):
-            if was != now:
-                raise WrongDeviceError(
-                    f"{part.axis}: the {what} was made on a drive with {number} {was}, this one has "
-                    f"{now}. It is not restored onto another drive."
-                )
+        if part.node_id != drive.node_id:
+            other: tuple[str, int, int] | None = ("node id", part.node_id, drive.node_id)
+        else:
+            other = other_number(part, drive)
+        if other is not None:
+            number, was, now = other
+            raise WrongDeviceError(
+                f"{part.axis}: the {what} was made on a drive with {number} {was}, this one has "
+                f"{now}. It is not restored onto another drive."
+            )
     if not trusted:
         nameless = [p for p in recorded if not by_axis[p.axis].identity.serial_number]
         if nameless:

@@ -24,7 +24,7 @@ from fieldtool.experiment.stepped.runner import Progress
 from fieldtool.identify.likelihood.expected import Expected
 from fieldtool.records.model import MachineModel
 from fieldtool.report.numbers import UNITS, ModelNumber, model_numbers
-from fieldtool.report.words import AT_ONCE
+from fieldtool.report.words import AT_ONCE, percent
 from fieldtool.workflow import SessionResult, parameter_table
 from fieldtool.workflow.planning import PlannedFast
 from fieldtool.workflow.verified import Verified
@@ -235,14 +235,14 @@ def _what_runs(progress: Progress | MultisineProgress) -> str:
 def expected_text(expected: Expected) -> str:
     """Return the accuracy to expect as one sentence: the worst of each kind, 95 %."""
     parts = [
-        f"{plural} within {f'{percent:.2g}' if percent < 99.5 else f'{percent:.0f}'} %"
+        f"{plural} within {percent(share)}"
         for kind, plural in (
             ("mass", "masses"),
             ("spring", "springs"),
             ("coupling", "couplings"),
             ("damper", "dampers"),
         )
-        if 0 < (percent := 196 * expected.relative(kind)) < np.inf
+        if 0 < (share := 1.96 * expected.relative(kind)) < np.inf
     ]
     return f"To expect (95 %): {', '.join(parts)}." if parts else "To expect: nothing is told."
 

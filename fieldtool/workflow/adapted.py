@@ -9,6 +9,7 @@ from fieldtool.errors import PlanRefusedError
 from fieldtool.experiment.forecast import Setting
 from fieldtool.experiment.multisine.design import LEAST_FACTOR, with_bias
 from fieldtool.experiment.multisine.forecast import (
+    TORQUE,
     allowed_peaks,
     experiment_peaks,
     forecast_multisine,
@@ -21,8 +22,6 @@ from fieldtool.records.model import FloatArray
 from fieldtool.records.recording import Experiment
 from fieldtool.workflow.planning import PlannedFast, excitations
 
-TORQUE = 3
-"""Row of the peaks."""
 TORQUE_KEPT = 0.95
 """Share of its torque limit that excitation, friction and noise of an axis may take together."""
 BESIDE_GROWS = 1.15

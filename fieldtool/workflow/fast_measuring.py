@@ -13,7 +13,7 @@ from fieldtool.experiment.axes import Axes
 from fieldtool.experiment.directions import check_directions, small_moves
 from fieldtool.experiment.forecast import Setting
 from fieldtool.experiment.multisine.design import fast_cycle_times, longest_cycle, mode_band
-from fieldtool.experiment.multisine.forecast import experiment_peaks
+from fieldtool.experiment.multisine.forecast import FOLLOWING_ERROR, experiment_peaks
 from fieldtool.experiment.multisine.plan import MultisinePlan
 from fieldtool.experiment.multisine.runner import run_multisine
 from fieldtool.experiment.stepped.design import undamped_modes
@@ -56,8 +56,6 @@ TOLERATED = 1.05
 """Excitation time over what was asked for, above which it is said."""
 LATE_SHARE = 0.01
 """Of the pilot's cycles that may begin late; with more, the next longer cycle is tried."""
-FOLLOWING_ERROR = 4
-"""Row of an experiment's peaks."""
 SEED = 22
 """Of the random phases: the same machine gets the same plan."""
 
@@ -266,9 +264,9 @@ class FastMeasurement:
         taken = torques_of(recording.experiments)
         if found.friction is None:
             main = self._gentler(main, taken, pilot)
-        main = freed_of_friction(main, now_known, found.noise, found.friction)
-        beside = np.maximum(taken - torques_foreseen(pilot, now_known), 0.0)
-        if found.friction is not None:
+        else:
+            main = freed_of_friction(main, now_known, found.noise, found.friction)
+            beside = np.maximum(taken - torques_foreseen(pilot, now_known), 0.0)
             main = with_room_for_torque(main, now_known, found.noise, beside)
         for note in main.plan.notes:
             session.screen.say(note)

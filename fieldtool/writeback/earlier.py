@@ -9,6 +9,7 @@ from pathlib import Path
 
 from drives.errors import ProfileError, WrongDeviceError
 from drives.parameters import DriveRecord, Journal, Memory, load_backup, load_journal
+from drives.parameters.guard import other_number
 from drives.parameters.values import ParameterDrive
 
 FIRST_BACKUP = "parameters-before.yaml"
@@ -36,21 +37,16 @@ def refuse_other_drives(backup_file: Path, drives: Iterable[ParameterDrive]) -> 
         return
     by_axis = {part.axis: part for part in parts}
     for drive in drives:
-        part, now = by_axis.get(drive.axis), drive.identity
-        if part is None:
-            continue
-        for number, was, found in (
-            ("vendor-ID", part.vendor_id, now.vendor_id),
-            ("product code", part.product_code, now.product_code),
-            ("serial number", part.serial_number, now.serial_number),
-        ):
-            if was != found:
-                raise WrongDeviceError(
-                    f"{drive.axis}: this session was begun on a drive with {number} {was}, node "
-                    f"{drive.node_id} now has {found}. New parameters are written only into the drives "
-                    "that they were designed for. Were node ids swapped? If a drive was exchanged on "
-                    "purpose, measure the machine again: fieldtool run. Nothing was moved or written."
-                )
+        part = by_axis.get(drive.axis)
+        other = None if part is None else other_number(part, drive)
+        if other is not None:
+            number, was, found = other
+            raise WrongDeviceError(
+                f"{drive.axis}: this session was begun on a drive with {number} {was}, node "
+                f"{drive.node_id} now has {found}. New parameters are written only into the drives "
+                "that they were designed for. Were node ids swapped? If a drive was exchanged on "
+                "purpose, measure the machine again: fieldtool run. Nothing was moved or written."
+            )
 
 
 def left_before(journal_file: Path, drives: Iterable[ParameterDrive]) -> Mapping[str, Memory]:

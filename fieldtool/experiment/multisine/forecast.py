@@ -14,6 +14,8 @@ from fieldtool.records.model import FloatArray
 SIMULATED_PERIODS = 2
 """Of each experiment without bias velocity; transients have their largest values before that."""
 _WHAT = ("excursion", "velocity", "acceleration", "torque", "following error")
+TORQUE, FOLLOWING_ERROR = _WHAT.index("torque"), _WHAT.index("following error")
+"""Rows of an experiment's peaks."""
 
 
 def forecast_multisine(plan: MultisinePlan, setting: Setting) -> tuple[AxisForecast, ...]:
