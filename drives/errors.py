@@ -78,6 +78,8 @@ class SdoError(DrivesError):
 
     def __init__(self, axis: str, index: int, subindex: int, message: str) -> None:
         self.axis, self.index, self.subindex = axis, index, subindex
+        self.what = message
+        """The message without its place."""
         super().__init__(f"{axis}, object 0x{index:04X}:{subindex:02X}: {message}")
 
 
@@ -86,10 +88,9 @@ class SdoAbortError(SdoError):
 
     def __init__(self, axis: str, index: int, subindex: int, code: int, verb: str) -> None:
         self.code = code
-        meaning = ABORT_CODES.get(code, "meaning unknown")
-        super().__init__(
-            axis, index, subindex, f"the drive refused to {verb} it: {meaning} (0x{code:08X})."
-        )
+        self.why = f"{ABORT_CODES.get(code, 'meaning unknown')} (0x{code:08X})"
+        """The code and its meaning."""
+        super().__init__(axis, index, subindex, f"the drive refused to {verb} it: {self.why}.")
 
 
 class SdoTimeoutError(SdoError):

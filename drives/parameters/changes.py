@@ -37,6 +37,11 @@ class Change:
         """Whether there is anything to write."""
         return not same(self.info, self.before_raw, self.after_raw)
 
+    @property
+    def wanted(self) -> str:
+        """The new value with its unit."""
+        return f"{self.after:.4g} {'' if self.unit == '1' else self.unit}".strip()
+
 
 @dataclass(frozen=True)
 class Written:

@@ -1,16 +1,19 @@
 """Carry a write-back out on the drives, step by step as the journal's rules say, or take it back."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 
 from drives.canopen_drive.interrupts import uninterrupted
 from drives.errors import (
     DrivesError,
+    SdoAbortError,
+    SdoError,
     StoppedError,
     UserStopError,
     WriteBackError,
     WriteBackMixedError,
 )
+from drives.objects import ObjectAddress
 from drives.parameters.access import take_over, unlock
 from drives.parameters.backup import Backup
 from drives.parameters.bring_back import BroughtBack, Found, SilentDriveError, bring_back
@@ -19,6 +22,7 @@ from drives.parameters.journal import (
     DriveRecord,
     Goal,
     Journal,
+    JournalEntry,
     Memory,
     Step,
     Storing,
@@ -42,6 +46,10 @@ class MismatchError(DrivesError):
     """A drive holds something else than what was written."""
 
 
+class NotTakenError(DrivesError):
+    """A drive did not take a value."""
+
+
 class Transaction:
     """One write-back over all drives of a machine.
 
@@ -63,6 +71,8 @@ class Transaction:
         what it raises takes the write back.  The journal is open meanwhile.
     stop_requested
         Asked before each drive stores and before the write ends: a stop takes the write back.
+    wanted
+        What new values are in physical units, in words, by axis and object; for messages.
     """
 
     def __init__(
@@ -74,7 +84,9 @@ class Transaction:
         tell: Tell = lambda _: None,
         prove: Prove | None = None,
         stop_requested: Callable[[], bool] = lambda: False,
+        wanted: Mapping[tuple[str, ObjectAddress], str] | None = None,
     ) -> None:
+        self._wanted = wanted or {}
         self._tell, self._prove, self._stop_requested = tell, prove, stop_requested
         self._drives = {drive.axis: drive for drive in drives}
         self._backups = {part.axis: part for part in backup.drives}
@@ -157,11 +169,26 @@ class Transaction:
                 changed = [e for e in entries if not same(e.info, e.before, e.after)]
                 unlock(drive)
                 for entry in changed:
-                    drive.write(entry.info, entry.after)
+                    self._write(drive, entry)
                 take_over(drive, {entry.info.address for entry in changed})
             else:
                 self._check(drive)
         self._end(step)
+
+    def _write(self, drive: ParameterDrive, entry: JournalEntry) -> None:
+        """Write one new value; where that fails, say which parameter, which value, and what to do."""
+        try:
+            drive.write(entry.info, entry.after)
+        except SdoError as error:
+            why = error.what
+            if isinstance(error, SdoAbortError):
+                physical = self._wanted.get((drive.axis, entry.info.address))
+                value = f"{entry.after} ({physical})" if physical else f"{entry.after}"
+                todo = _TODO.get(error.code, _LOOK_UP).format(name=entry.info.name)
+                why = f"the drive holds {entry.before} and refused to take {value}: {error.why}. {todo}"
+            raise NotTakenError(
+                f"{drive.axis}, {entry.info.name}, object {entry.info.address}: {why}"
+            ) from error
 
     def _check(self, drive: ParameterDrive) -> None:
         """Read a drive's parameters back, and see that they are those of the goal."""
@@ -177,9 +204,10 @@ class Transaction:
         for info, value in wanted.items():
             found = drive.read(info)
             if not same(info, found, value):
+                physical = self._wanted.get((drive.axis, info.address)) if forward else None
                 raise MismatchError(
                     f"{drive.axis}, {info.name}, object {info.address}: wrote {value}, the drive "
-                    f"holds {found}."
+                    f"holds {found}{f' (in its own units; {physical} was wanted)' if physical else ''}."
                 )
 
     def _store(self, drive: ParameterDrive) -> None:
@@ -335,6 +363,20 @@ class Transaction:
         return f" {', '.join(back)} stored the old values again, so they survive a power cycle."
 
 
+_LOOK_UP = "Compare this object with the drive's manual, and correct {name} in the drive profile."
+_RANGE = (
+    "Look up its range in the drive's manual, give it as `minimum` and `maximum` of {name} in the drive "
+    "profile, and design anew."
+)
+_STATE = (
+    "The drive takes {name} in another state: see in its manual in which, and whether it is locked or "
+    "somebody else has the control."
+)
+_TODO = {
+    **dict.fromkeys((0x06090030, 0x06090031, 0x06090032, 0x06090036), _RANGE),
+    **dict.fromkeys((0x08000020, 0x08000021, 0x08000022), _STATE),
+}
+"""What to do, by the code with which a drive refused a value."""
 _LOST = "lost the values that were brought back: did it lose its supply?"
 _ENDED_WORDS = {
     "new": "The write had ended: all drives hold the new values.",

@@ -148,9 +148,9 @@ def apply(
     journal = planned_journal(machine, drives, changes, backup_path.name, storing, earlier)
     keeper = JournalKeeper(journal_path)
     backup = load_backup(backup_path)
-    transaction = Transaction(
-        drives, journal, backup, keeper, tell_storing(drives, say), prove, stop_requested
-    )
+    wanted = {(one.axis, one.info.address): one.wanted for one in changes}
+    tell = tell_storing(drives, say)
+    transaction = Transaction(drives, journal, backup, keeper, tell, prove, stop_requested, wanted)
     try:
         with keeper:
             transaction.write()

@@ -1,6 +1,7 @@
 """Write-back through the bus: nothing changes unasked, all or nothing, undoable, and told."""
 
 import json
+import re
 import signal
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -259,9 +260,30 @@ def test_a_write_refused_in_the_middle_restores_every_drive(session):
     dictionary.guards[VELOCITY_I] = lambda v: seen.append(v) or 0x08000022
     outcome = write(session)
     assert outcome.code == 6, outcome.err
-    assert "arm, object 0x2010:03: the drive refused to write it" in outcome.err
+    said = " ".join(outcome.err.split())
+    assert re.search(
+        r"arm, velocity_i, object 0x2010:03: the drive holds \d+ and refused to take \d+ "
+        r"\([\d.]+ N m/rad\): not in the present state of the drive \(0x08000022\)",
+        said,
+    )
+    assert "The drive takes velocity_i in another state" in said
     assert "Nothing was changed: all parameters were restored and read back" in outcome.err
     assert seen, "it came that far"
+    assert session.changed() == {}
+
+
+def test_a_value_beyond_what_the_drive_takes_names_parameter_value_unit_and_what_to_do(session):
+    """The profile does not know the drive's own range: only the drive does."""
+    session.machine.node(TABLE).dictionary.guards[0x2010, 2] = lambda _: 0x06090031
+    outcome = write(session)
+    assert outcome.code == 6, outcome.err
+    said = " ".join(outcome.err.split())
+    assert re.search(
+        r"table, velocity_p, object 0x2010:02: the drive holds \d+ and refused to take 2000 "
+        r"\(2 N m s/rad\): the value is too high \(0x06090031\)",
+        said,
+    )
+    assert "`minimum` and `maximum` of velocity_p in the drive profile, and design anew" in said
     assert session.changed() == {}
 
 
@@ -271,7 +293,8 @@ def test_a_value_kept_differently_restores_every_drive(session):
     outcome = write(session)
     assert outcome.code == 6
     assert (
-        f"arm, position_p, object 0x2010:01: wrote 20000, the drive holds {before}" in outcome.err
+        f"arm, position_p, object 0x2010:01: wrote 20000, the drive holds {before} (in its own units; "
+        "20 1/s was wanted)" in " ".join(outcome.err.split())
     )
     assert session.changed() == {}
 
