@@ -71,7 +71,7 @@ def design(
         tuning = workflow.redesign(folder, response, bound, png, bar)
     show_tuning(console, tuning)
     for axis in tuning.axes:
-        console.print(Text(f"{axis.axis}:"))
+        console.print(Text(f"{axis.axis} (SI):"))
         for name, value in axis.parameters.items():
             console.print(indented(f"{name:22}{value:.6g}"))
     console.print(Text(f"Kept in {folder}; `fieldtool write {folder}` brings it into the drives."))

@@ -238,8 +238,11 @@ def _reason(task: Task, k: int, servo: Servo) -> str:
     kinds = slots_of(servo)
     at_hz = [np.sqrt(f.denominator[1]) / (2 * np.pi) for f in servo.loop.filters]
     filters = ", ".join(f"{kind} at {f:.3g} Hz" for kind, f in zip(kinds, at_hz, strict=True))
+    heavy = f"total inertia {axis.total_mass:.4g} kg m2"
+    if axis.kind == "linear":
+        heavy = f"total mass {axis.total_mass:.4g} kg"
     return (
-        f"total inertia {axis.total_mass:.4g}, {at}: optimised for a peak of sensitivity of at most "
+        f"{heavy}, {at}: optimised for a peak of sensitivity of at most "
         f"{task.bound:.3g} on {len(task.machines)} machines within the model's uncertainty; "
         f"{filters or 'no filter'}."
     )

@@ -4,12 +4,22 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from math import inf, isfinite, nan
 
+from drives.units import Kind, unit_on
 from fieldtool.design.servo import Servo, Timing, servo_from_parameters
 
 GAINS = ("position_p", "velocity_p", "velocity_i")
 PID = ("pid_p", "pid_i", "pid_d")
 FILTERS = (1, 2)
 CAUTIOUS = Timing()
+UNITS = {
+    "position_p": "1/s",
+    "velocity_p": "N m s/rad",
+    "velocity_i": "N m/rad",
+    "inertia_ff": "kg m2",
+    "velocity_filter": "Hz",
+    **{f"filter{k}_frequency": "Hz" for k in FILTERS},
+}
+"""Of parameters on rotary axes; those that are not named have none."""
 
 
 @dataclass(frozen=True)
@@ -67,6 +77,11 @@ class DriveSide:
     """What the drive holds now, by parameter, SI; None where it can not be read."""
     unreadable: str = ""
     """Why not, in words."""
+    kind: Kind = "rotary"
+
+    def words(self, name: str, value: float) -> str:
+        """Return a parameter's value with its unit."""
+        return f"{value:.4g} {unit_on(self.kind, UNITS.get(name, ''))}".strip()
 
     def has(self, name: str) -> bool:
         """Whether the drive has a parameter."""
@@ -107,7 +122,8 @@ class DriveSide:
     def out_of_range(self, parameters: Mapping[str, float]) -> list[str]:
         """Return what does not fit into the drive, a phrase each."""
         return [
-            f"{name} {parameters[name]:.4g} (the drive holds {low:.4g} to {high:.4g})"
+            f"{name} {self.words(name, parameters[name])} (the drive holds {low:.4g} to "
+            f"{self.words(name, high)})"
             for name, hold in self.holds.items()
             if name in parameters
             for low, high in [hold.bounds]
@@ -117,7 +133,7 @@ class DriveSide:
     def largest(self, parameters: Mapping[str, float]) -> list[str]:
         """Return gains and inertia fed forward that are the most that the drive holds, a phrase each."""
         return [
-            f"{name} {parameters[name]:.4g}"
+            f"{name} {self.words(name, parameters[name])}"
             for name in (*GAINS, "inertia_ff")
             if name in parameters and name in self.holds
             if parameters[name] >= (1 - 1e-6) * self.holds[name].bounds[1]

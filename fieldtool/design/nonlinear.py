@@ -21,9 +21,10 @@ def notes_of(model: MachineModel, servos: Sequence[Servo]) -> list[str]:
         if not isinstance(name, str) or name not in model.names:
             continue
         servo = servos[model.names.index(name)]
-        unit = "rad" if model.axes[model.names.index(name)].kind == "rotary" else "m"
+        rotary = model.axes[model.names.index(name)].kind == "rotary"
+        unit, torque_unit = ("rad", "N m") if rotary else ("m", "N")
         if kind in DRY:
-            notes += _friction(name, effect, servo, unit)
+            notes += _friction(name, effect, servo, unit, torque_unit)
         elif kind == "backlash":
             gap = number(effect, "gap") or 2 * number(effect, "half_gap")
             notes.append(
@@ -39,7 +40,9 @@ def notes_of(model: MachineModel, servos: Sequence[Servo]) -> list[str]:
     return notes
 
 
-def _friction(name: str, effect: Mapping[str, Any], servo: Servo, unit: str) -> list[str]:
+def _friction(
+    name: str, effect: Mapping[str, Any], servo: Servo, unit: str, torque_unit: str
+) -> list[str]:
     loop = servo.loop
     torque = max(
         number(effect, "torque"),
@@ -54,7 +57,7 @@ def _friction(name: str, effect: Mapping[str, Any], servo: Servo, unit: str) -> 
     if loop.velocity_i <= 0:
         return [f"{name}: dry friction may hold the motor up to {away:.3g} {unit} off its target."]
     return [
-        f"{name}: dry friction of {torque:.3g} may hold the motor up to {away:.3g} {unit} off its "
-        f"target for about {loop.velocity_p / loop.velocity_i:.2g} s, and then let it creep or hunt; "
-        "what is predicted of moves has it in."
+        f"{name}: dry friction of {torque:.3g} {torque_unit} may hold the motor up to {away:.3g} {unit} "
+        f"off its target for about {loop.velocity_p / loop.velocity_i:.2g} s, and then let it creep or "
+        "hunt; what is predicted of moves has it in."
     ]

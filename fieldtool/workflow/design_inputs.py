@@ -127,6 +127,7 @@ def _side(axis: AxisProfile, machine: MachineProfile, kept: _Kept, cycle: float)
         _holds(profile, conversion, present or {}),
         present,
         why,
+        axis.kind,
     )
 
 

@@ -314,7 +314,7 @@ def test_friction_backlash_and_delay_are_told(random_model: RandomModel) -> None
     )
     tuning = design(replace(model, effects=effects), sides_of(model))
     text = " ".join(tuning.notes)
-    assert "dry friction of 3 may hold the motor up to" in text
+    assert "dry friction of 3 N m may hold the motor up to" in text
     assert "backlash of 0.002 rad" in text
     assert "2 ms late" in text
     servo = sides_of(model)[0].servo(tuning.axes[0].parameters)
