@@ -8,12 +8,16 @@ from drives.canopen_drive import CanopenDrive
 from fieldtool.design.predict import Prediction
 from fieldtool.design.servo import Servo
 from fieldtool.errors import PlanRefusedError
+from fieldtool.experiment.multisine.excitation import signals
+from fieldtool.experiment.multisine.plan import MultisinePlan
 from fieldtool.experiment.verification.controller import locked_torque
 from fieldtool.experiment.verification.steps import NUDGE_TORQUE
 from fieldtool.workflow.trial_loops import drive_loop
 
 NOT_AS_SAID, FASTER_THAN_SAID = 1.25, 1.25
 """Factors by which a peak of sensitivity, and a bandwidth, may be off what the tuning says."""
+FEWEST_STEPS = 2.0
+"""Of a drive's torque, or of its encoder, that an excitation has at least, zero to peak."""
 SETTLED_CYCLES = 24
 """After which the answer to one count has shown how large it is."""
 
@@ -35,6 +39,26 @@ def check_a_count(drive: CanopenDrive, servos: Sequence[Servo], limit: float, cy
             )
 
 
+def check_excited(excitation: MultisinePlan, drives: Sequence[CanopenDrive]) -> None:
+    """Refuse an excitation that is so small that drives round it away."""
+    one = excitation.experiments[0]
+    for k, drive in enumerate(drives):
+        by_torque = bool(np.any(one.torque[:, k]))
+        phasors = one.torque if by_torque else one.reference
+        step = abs(drive.scaling.torque if by_torque else drive.scaling.position)
+        size = float(np.abs(signals(phasors[:, [k]], one.lines, one.samples)).max())
+        if size >= FEWEST_STEPS * step:
+            continue
+        what, unit = (
+            ("torque", drive.torque_unit) if by_torque else ("position", drive.position_unit)
+        )
+        raise PlanRefusedError(
+            f"{drive.axis}: within the limits in the machine profile its {what} may be excited by "
+            f"{size:.2g} {unit}, and its drive takes it in steps of {step:.2g} {unit}. Allow it more, "
+            "above all following_error, if the machine bears it."
+        )
+
+
 def check_as_designed(
     after: Prediction, stated: Mapping[str, float], designed: Prediction | None
 ) -> None:
@@ -54,6 +78,17 @@ def check_as_designed(
                 f"{axis.axis}: its tuning says that {wrong}, by the model. Either they were changed, or "
                 "the model was. Nothing was moved or written. Design anew (`fieldtool design`)."
             )
+
+
+def check_present(before: Prediction) -> None:
+    """Refuse a machine that swings by its model as its drives are now."""
+    if not before.stable:
+        raise PlanRefusedError(
+            "with the parameters that are in the drives now the machine is not stable by its model, so "
+            "they are not tried, and nothing can be compared with them. Nothing was moved or written. "
+            "Lower gains by hand (velocity_i, then position_p and velocity_p), and measure and design "
+            "anew: `fieldtool run`. Or write without a trial (--no-verify); then nothing can be stored."
+        )
 
 
 def check_stable(after: Prediction, bound: float) -> None:

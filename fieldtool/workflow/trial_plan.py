@@ -26,7 +26,13 @@ from fieldtool.records.closed_loop import AxisLoop
 from fieldtool.records.model import FloatArray
 from fieldtool.workflow.design_inputs import moves_of, timing_of
 from fieldtool.workflow.preparation import check_seen
-from fieldtool.workflow.trial_checks import check_a_count, check_as_designed, check_stable
+from fieldtool.workflow.trial_checks import (
+    check_a_count,
+    check_as_designed,
+    check_excited,
+    check_present,
+    check_stable,
+)
 from fieldtool.workflow.trial_loops import answer_torque, drive_loop, first_answer
 from fieldtool.workflow.trial_moves import MOST, free_move, takes_too_much, trial_move
 
@@ -150,7 +156,8 @@ def plan_trial(
     Raises
     ------
     PlanRefusedError
-        If the new loops are not stable by the model, or there is no room to move.
+        If the new loops are not stable by the model, there is no room to move, or an excitation within
+        all limits would not be seen.
     """
     cycle = fast_cycle_times(setting.model, group.shortest_cycle)[0]
     old = tuple(servo_of(drive, (), cycle) for drive in group.drives)
@@ -161,6 +168,7 @@ def plan_trial(
     moves = tuple(free_move(*pair) for pair in zip(group.drives, typical, strict=True))
     for _ in range(TIMES):
         before, after = (predict(setting.model, servos, moves) for servos in (old, new))
+        check_present(before)
         check_stable(after, bound)
         check_as_designed(after, stated, designed)
         over = [takes_too_much(setting, k, (before, after)) for k in range(len(moves))]
@@ -240,7 +248,13 @@ def without_feed_forward(drive: CanopenDrive, servo: Servo) -> AxisLoop:
 def _with_excitation(
     plan: TrialPlan, group: CanopenGroup, setting: Setting, steps: Sequence[float]
 ) -> TrialPlan:
-    """Add the small multisine; where it can not be planned the note says why."""
+    """Add the small multisine.
+
+    Raises
+    ------
+    PlanRefusedError
+        If none can be planned that is seen: what was not measured is never kept.
+    """
     cycle = plan.trial.cycle_time
     limits = torque_limits(setting.limits)
     highest = 0.9 * HIGHEST / cycle
@@ -260,10 +274,14 @@ def _with_excitation(
     here = [replace(setting, loops=own, centre=at) for own in loops]
     try:
         excitation, lines = sensitivity_plan(here, peaks, group.torque_offsets, cycle)
-        done = np.max([expected_peaks(excitation, one) for one in here], axis=0)
+        check_excited(excitation, group.drives)
     except PlanRefusedError as error:
-        note = f"the sensitivities are not measured: {error}"
-        return replace(plan, notes=(*plan.notes, note))
+        raise PlanRefusedError(
+            f"the peak of sensitivity could not be measured: {error} Nothing was moved or written, for "
+            "nothing is kept that was not measured; --no-verify writes without a trial, and then "
+            "nothing can be stored."
+        ) from None
+    done = np.max([expected_peaks(excitation, one) for one in here], axis=0)
     trial = replace(
         plan.trial,
         excitation=excitation,

@@ -140,8 +140,9 @@ class Verification:
             except (OscillationError, IdentificationError) as error:
                 error.add_note(
                     "That was with the parameters that are in the drives now, in a trial before "
-                    "anything was written; nothing was. Lower the axis' gains by hand (velocity_i, "
-                    "then position_p and velocity_p), and measure and design anew: `fieldtool run`."
+                    "anything was written; nothing was. If the axis swings, lower its gains by hand "
+                    "(velocity_i, then position_p and velocity_p); if it sags as it is enabled, raise "
+                    "velocity_i and position_p. Then measure and design anew: `fieldtool run`."
                 )
                 raise
 

@@ -285,19 +285,42 @@ def test_parameters_that_are_slower_than_the_old_ones_are_taken_back(session):
     assert session.changed() == {}
 
 
-def test_an_axis_that_oscillates_already_is_said_and_nothing_is_written(make_bench, profile_of_two):
+def test_an_axis_that_oscillates_by_its_model_is_not_moved(make_bench, profile_of_two):
     gains = profile_of_two["simulation"]["axes"][0]["gains"]
     gains["position_p"], gains["velocity_i"] = 300.0, 160.0
     bench = make_bench(profile_of_two)
     bench.out.mkdir()
     (bench.out / "machine.yaml").write_text(bench.profile.read_text())
     write_tuning(bench, GOOD)
+    ways = Heard(bench)
     outcome = bench.command("write", bench.out, "--yes")
-    assert outcome.code == 4, outcome.err
-    assert "table" in outcome.err
-    assert "in the drives now" in outcome.err
+    assert outcome.code == 3, outcome.err
+    assert "in the drives now the machine is not stable" in " ".join(outcome.err.split())
+    assert not ways.enabled
     assert bench.changed() == {}
-    assert bench.powered() == {}
+
+
+def test_an_axis_that_oscillates_already_is_said_and_nothing_is_written(session, monkeypatch):
+    """Its drive does not do what its parameters say: no model knows that."""
+    from fieldtool.workflow.verifying import Verification
+
+    present = Verification.before
+    fault = Gains(TABLE, 30.0)
+
+    def swinging(one):
+        session.inject(fault)
+        try:
+            present(one)
+        finally:
+            session.machine.lift(fault)
+
+    monkeypatch.setattr(Verification, "before", swinging)
+    outcome = write(session)
+    assert outcome.code == 4, outcome.err
+    assert "table: oscillates at about" in outcome.err
+    assert "in the drives now" in outcome.err
+    assert session.changed() == {}
+    assert session.powered() == {}
 
 
 def test_nobody_is_asked_to_move_means_nothing_moves(session):
@@ -389,24 +412,36 @@ def test_ctrl_c_after_the_last_motion_stores_nothing(session, monkeypatch, momen
         assert verification(session)["verdict"] == "restored"
 
 
-def test_what_could_not_be_measured_is_not_kept_and_says_so(session, monkeypatch):
-    """No lines fit: no sensitivities, empty panels, and no verdict that hides it."""
+def test_what_can_not_be_measured_is_refused_before_anything_moves(session, monkeypatch):
     from fieldtool.errors import PlanRefusedError
     from fieldtool.workflow import trial_plan
 
     def refused(*_):
-        raise PlanRefusedError("no lines fit")
+        raise PlanRefusedError("no lines fit.")
 
     monkeypatch.setattr(trial_plan, "sensitivity_plan", refused)
+    ways = Heard(session)
     outcome = write(session, "--store")
-    assert outcome.code == 6, outcome.err
-    assert "sensitivity with the new parameters was not measured" in outcome.err
-    found = verification(session)
-    assert found["verdict"] == "restored"
-    assert any("no lines fit" in note for note in found["notes"])
-    assert (session.out / "verification.png").stat().st_size > 10_000
+    assert outcome.code == 3, outcome.err
+    said = " ".join(outcome.err.split())
+    assert "the peak of sensitivity could not be measured: no lines fit." in said
+    assert "Nothing was moved or written" in said
+    assert not ways.enabled
     assert session.changed() == {}
-    assert session.stored() == {TABLE: {}, ARM: {}}
+
+
+def test_limits_that_leave_an_excitation_of_less_than_a_step_are_named(session):
+    machine = session.out / "machine.yaml"
+    machine.write_text(machine.read_text().replace("30 deg", "0.01 deg"))
+    ways = Heard(session)
+    outcome = write(session)
+    assert outcome.code == 3, outcome.err
+    said = " ".join(outcome.err.split())
+    assert "could not be measured" in said
+    assert "its drive takes it in steps of" in said
+    assert "following_error" in said
+    assert not ways.enabled
+    assert session.changed() == {}
 
 
 @pytest.mark.parametrize("where", ["picture", "conclusion", "storing"])

@@ -348,9 +348,10 @@ class OscillationWatch:
         swung = self._positions[k].take(position)
         unit, torque_unit = self._units[k]
         if not allowed.low[k] <= position <= allowed.high[k]:
+            sags = ", or it sags under its load" if allowed.resting else ""
             return (
                 f"is at {position:.5g} {unit}, outside of {allowed.low[k]:.5g} to "
-                f"{allowed.high[k]:.5g} {unit} where it has to stay: its loop runs away or swings"
+                f"{allowed.high[k]:.5g} {unit} where it has to stay: its loop runs away or swings{sags}"
             )
         push = torque - (self._rest[k] if self._rest else torque)
         if abs(push) > allowed.torque[k]:

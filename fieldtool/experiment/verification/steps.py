@@ -6,7 +6,7 @@ from functools import partial
 
 import numpy as np
 
-from drives.api import Capture, FloatArray, Motion
+from drives.api import AxisLimits, Capture, FloatArray, Motion
 from drives.errors import StoppedError
 from fieldtool.experiment.axes import Axes, sample_times, torque_limits
 from fieldtool.experiment.directions import CHECK_PUSHED
@@ -117,12 +117,14 @@ class Steps:
         return NUDGE_TORQUE * torque_limits(self._axes.limits)
 
     def nudge(self, move: TrialMove) -> None:
-        """Go a little way and back; the axis has to go there, and no other may move."""
+        """Go a little way and back; the axis has to go there, and no other may move.
+
+        Never faster than the move itself, which was planned to keep the axis' limits.
+        """
         axes, k, step = self._axes, move.axis, self._motion.cycle_time
         size = max(NUDGE_SHARE * abs(move.distance), NUDGE_COUNTS * float(axes.counts[k]))
         size = float(np.copysign(min(size, abs(move.distance)), move.distance))
-        limits = axes.limits[k]
-        there = smooth_move(size, limits.velocity, limits.acceleration, step, NUDGE_TIME)
+        there = smooth_move(size, *_pace(move, axes.limits[k], step), step, NUDGE_TIME)
         pause = np.full(max(2, round(NUDGE_TIME / step)), 1.0)
         path = np.concatenate([there, size * pause, size - there, 0 * pause])
         low, high = self._ways(k, size, BEYOND * abs(size))
@@ -209,6 +211,16 @@ class Steps:
     def _experiment(self, capture: Capture, k: int, name: str, note: str = "") -> Experiment:
         driven = (self._axes.names[k],)
         return recorded(capture, driven, name, self._motion.cycle_time, note)
+
+
+def _pace(move: TrialMove, limits: AxisLimits, cycle: float) -> tuple[float, float]:
+    """Return the largest velocity and acceleration of a move, within the axis' limits."""
+    velocity = np.diff(move.reference, append=move.distance) / cycle
+    acceleration = np.diff(velocity, prepend=0.0) / cycle
+    return (
+        min(limits.velocity, float(np.abs(velocity).max())),
+        min(limits.acceleration, float(np.abs(acceleration).max())),
+    )
 
 
 def recorded(
