@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import step
 
 from fieldtool.records.closed_loop import AxisLoop, loop_from_parameters
 from fieldtool.records.model import FloatArray
@@ -27,6 +28,8 @@ CAUTIOUS_LAG = 1e-3
 CAUTIOUS_PERIOD = 0.5e-3
 """s: period of the loops of such a drive."""
 OFF = float("inf")
+POINTS = 400
+"""In time, of an answer to a step."""
 
 
 @dataclass(frozen=True)
@@ -134,6 +137,32 @@ class Servo:
         gain = self._torque(s) * self.loop.velocity_p * (self.loop.position_p + velocity)
         power = np.trapezoid(np.abs(gain) ** 2, omega) / nyquist
         return float(resolution / np.sqrt(12) * np.sqrt(power))
+
+    def count_torque(self, resolution: float) -> float:
+        """Return the largest torque reference that one step of the encoder makes, N m or N.
+
+        An axis that stands where its encoder just turns over answers to single steps now and then:
+        rarely, so that their RMS says little of them.  The integrator is left out: it is slow.
+
+        Parameters
+        ----------
+        resolution
+            One step of the encoder, rad or m.
+        """
+        rate = 1 / (self.timing.period or CAUTIOUS_PERIOD)
+        w = min(2 * np.pi * self.velocity_filter, rate)
+        p = self.loop.position_p
+        numerator, denominator = np.array([p + w, p * w]), np.array([1.0, w])
+        slowest = w
+        for biquad in self.loop.filters:
+            numerator = np.polymul(numerator, biquad.numerator)
+            denominator = np.polymul(denominator, (1.0, *biquad.denominator))
+            slowest = min(slowest, np.sqrt(biquad.denominator[1]))
+        answers = [
+            step((np.trim_zeros(numerator, "f"), denominator), T=np.linspace(0.0, end, POINTS))[1]
+            for end in (5 / w, 10 / slowest)
+        ]
+        return float(resolution * self.loop.velocity_p * np.abs(answers).max())
 
 
 @cache

@@ -56,6 +56,9 @@ class Axes:
     stiffness: FloatArray | None = None
     """Torque that each loop asks for at once when its target leaves it, shape (M,), N m/rad or N/m;
     None: not known."""
+    pace: FloatArray | None = None
+    """1/s, position_p of each loop without feed-forward, shape (M,): an axis comes to its target as
+    exp(-pace t); None: not known."""
     torque_offsets: tuple[bool, ...] = ()
     """Which drives take torque offsets with their targets; none where it is empty."""
 

@@ -51,8 +51,9 @@ PUSHED_WAY = 3.0
 """Times the way that its pulses may take an axis, by the prior model, that it may go in them."""
 CHECK_ASTRAY_ERROR = 0.004
 """Share of the following error limit that it may go astray in any case."""
-CHECK_TIME = 1.0
-"""Seconds that each of these moves takes at least, so that slow loops follow it."""
+CHECK_TIME, CHECK_LAGS, CHECK_TIME_MOST = 1.0, 3.0, 12.0
+"""Seconds that each of these moves takes at least; times the lag of its position loop that it takes, so
+that slow loops follow it; but not more than this for the loop's sake, s."""
 CHECK_QUIET = 0.5
 """Share of what it may drift within which an axis counts as standing, before the check begins;
 where it stands does not matter: friction may hold it beside its target."""
@@ -193,6 +194,12 @@ def _check_pace(axes: Axes) -> None:
             )
 
 
+def _shortest(axes: Axes, k: int) -> float:
+    """Return the seconds that an axis' move takes at least: some lags of its position loop."""
+    pace = 0.0 if axes.pace is None else float(axes.pace[k])
+    return min(max(CHECK_TIME, CHECK_LAGS / pace), CHECK_TIME_MOST) if pace > 0 else CHECK_TIME
+
+
 class _DirectionCheck:
     """One axis' small move, in slices of a few cycles that are judged as they come.
 
@@ -228,7 +235,7 @@ class _DirectionCheck:
             CHECK_SHARE * limits.velocity,
             CHECK_SHARE * limits.acceleration,
             cycle_time,
-            CHECK_TIME,
+            _shortest(axes, k),
         )
         self._rows = there.size
         rest, away = np.zeros(self._rest), np.full(self._rest, self._wanted)

@@ -142,5 +142,6 @@ def axes_of(group: CanopenGroup, setting: Setting) -> Axes:
         resolution,
         inertia,
         stiffness,
+        np.array([loop.position_p for loop in setting.loops]),
         group.torque_offsets,
     )

@@ -42,6 +42,8 @@ EXCITED = 3.0
 """Times what the excitation does by the model that it may do."""
 NOISE_SWINGS = 12.0
 """Times the RMS of the torque that an encoder's steps make: by so much it may swing, peak to peak."""
+COUNT_SWINGS = 2.5
+"""Times the torque that a single count makes: one to, one fro, and what else is heard."""
 ROUNDED_TARGETS = 3.5
 """Targets are whole counts: their second difference, a cycle squared apart, may swing by so many counts,
 peak to peak, and the inertia that is fed forward makes torque of it."""
@@ -115,7 +117,8 @@ def torque_steps(drive: CanopenDrive, servo: Servo, cycle_time: float) -> float:
 
 def encoder_swing(drive: CanopenDrive, servo: Servo) -> float:
     """Return how far the steps of the encoder may make a torque swing at rest, peak to peak."""
-    return NOISE_SWINGS * servo.torque_noise(abs(drive.scaling.position))
+    count = abs(drive.scaling.position)
+    return max(NOISE_SWINGS * servo.torque_noise(count), COUNT_SWINGS * servo.count_torque(count))
 
 
 def _values(drive: CanopenDrive, changes: Sequence[Change]) -> Mapping[str, float]:

@@ -1,11 +1,13 @@
 """Direction check and watch of stuck encoders on drives with friction and with coarse encoders."""
 
 from copy import deepcopy
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from drives.canopen_drive.channel import INPUT, channel_of
+from drives.errors import SafetyStopError
 from fieldtool.experiment.axes import Axes
 from fieldtool.experiment.directions import check_directions
 
@@ -28,6 +30,24 @@ def test_friction_and_coarse_encoders_are_no_wrong_direction(make_bench, profile
         counts = np.array([drive.scaling.position for drive in group.drives])
         axes = Axes(group.axes, limits, np.zeros(2), ("rad", "rad"), counts)
         check_directions(group, axes, CYCLE, kept.append)
+    assert [e.complete for e in kept] == [True, True]
+    assert bench.powered() == {}
+
+
+def test_slow_loops_are_given_the_time_that_they_need(make_bench, profile_of_two):
+    """As a machine of 0.5 Hz has them: an axis comes to its target within seconds, not within one."""
+    slow = {"position_p": 0.55, "velocity_p": 0.1, "velocity_i": 0.05, "velocity_ff": 0.0}
+    bench = make_bench(machine(profile_of_two, {"gains": slow}))
+    kept = []
+    with bench.connected() as group:
+        limits = tuple(drive.limits for drive in group.drives)
+        counts = np.array([drive.scaling.position for drive in group.drives])
+        axes = Axes(group.axes, limits, np.zeros(2), ("rad", "rad"), counts)
+        with pytest.raises(SafetyStopError, match="does not follow"):
+            check_directions(group, axes, CYCLE, lambda _: None)
+        group.drives[0].wait(5.0)
+        paced = replace(axes, pace=np.full(2, slow["position_p"]))
+        check_directions(group, paced, CYCLE, kept.append)
     assert [e.complete for e in kept] == [True, True]
     assert bench.powered() == {}
 

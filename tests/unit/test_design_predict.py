@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.linalg import expm
+from scipy.signal import lsim
 
 from drives.sim.effects import CoulombFriction
 from drives.sim.firmware import DriveHardware, Parameter, SimulatedAxes
@@ -259,6 +260,27 @@ def test_noise_of_an_encoder_as_the_firmware_makes_it() -> None:
         filtered[n] = filtered[n - 1] + share * (velocity[n] - filtered[n - 1])
     torque = 2.0 * (30.0 * rounded + filtered)
     assert servo.torque_noise(step) == pytest.approx(torque[100:].std(), rel=0.03)
+
+
+@pytest.mark.parametrize("filters", [(), (Biquad.low_pass(300.0, 0.5),)], ids=["bare", "low-pass"])
+def test_a_count_makes_the_torque_that_the_firmware_makes_of_it(
+    filters: tuple[Biquad, ...],
+) -> None:
+    """One step of the encoder of an axis that is held, cycle by cycle as a drive computes it."""
+    rate, resolution = 8000.0, 2 * np.pi / 2**14
+    loop = AxisLoop(60.0, 2.0, 0.0, filters=filters)
+    late = 1 - np.exp(-2 * np.pi * 130.0 / rate)
+    speed, told = 0.0, []
+    for n in range(400):
+        moved = rate * resolution if n == 1 else 0.0
+        speed += late * (moved - speed)
+        told.append(2.0 * (60.0 * resolution * (n >= 1) + speed))
+    torque = np.array(told)
+    for one in filters:
+        system = (np.trim_zeros(one.numerator, "f"), (1.0, *one.denominator))
+        torque = lsim(system, torque, np.arange(400) / rate)[1]
+    found = Servo(loop, 130.0, Timing(0.0, 1 / rate)).count_torque(resolution)
+    assert found == pytest.approx(np.abs(torque).max(), rel=0.07)
 
 
 def test_noise_of_rounded_targets_as_the_firmware_makes_it() -> None:
