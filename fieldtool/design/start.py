@@ -6,7 +6,7 @@ from math import inf
 
 import numpy as np
 
-from fieldtool.design.drive_side import PID, DriveSide
+from fieldtool.design.drive_side import GAINS, PID, DriveSide
 from fieldtool.design.machine import Machine
 from fieldtool.design.robust import stable_on_all
 from fieldtool.design.rule import DesignError, rule
@@ -43,14 +43,26 @@ def plain_start(
     """
     modes = np.concatenate([machines[0].modes, machines[0].held_modes])
     lowest = 0.3 * float(modes.min()) if modes.size else 2 * np.pi
+    ruled = rule(model)
     found = [
         _begin(loop, axis, side, lowest, top)
-        for loop, axis, side in zip(rule(model), model.axes, sides, strict=True)
+        for loop, axis, side in zip(ruled, model.axes, sides, strict=True)
     ]
     for _ in range(MOST_LOWERED):
         if stable_on_all(machines, tuple(best.servo for best in found)):
             return tuple(found)
         found = [replace(best, servo=slower(best.servo)) for best in found]
+    outside = [
+        f"{side.axis}: {words}"
+        for loop, side in zip(ruled, sides, strict=True)
+        for words in side.out_of_range({name: getattr(loop, name) for name in GAINS})
+    ]
+    if outside:
+        raise DesignError(
+            f"no gains that are stable fit into what the drives hold, whose ranges are too small: "
+            f"{'; '.join(outside)}. Nothing is written. Choose other units or ranges in the drive, or "
+            "enter gains by hand."
+        )
     raise DesignError(
         "no gains were found that are stable on every machine that the model's uncertainty allows; "
         "nothing is written. Measure longer (--time), or give the number of masses with `fieldtool "

@@ -1,7 +1,10 @@
 """What a design is told of drives: from a backup as from the drive itself; what is said where not."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from importlib.resources import files
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +17,7 @@ from drives.profile import load_machine
 from fieldtool.cli.main import main
 from fieldtool.design.drive_side import GAINS, DriveSide
 from fieldtool.design.rule import DesignError
-from fieldtool.records.model_file import write_model
+from fieldtool.records.model_file import read_model, write_model
 from fieldtool.records.recording import save
 from fieldtool.records.session_folder import SessionFolder
 from fieldtool.records.yaml_file import write_yaml
@@ -201,3 +204,93 @@ def test_parameters_are_designed_for_the_controllers_own_cycle_where_the_profile
         (tmp_path / "wrong.yaml").write_text(text)
         with pytest.raises(ProfileError, match=f"controller_cycle: .*{told}"):
             load_machine(tmp_path / "wrong.yaml")
+
+
+def lacking(folder: SessionFolder, change: Callable[[dict[str, Any]], None]) -> None:
+    """Give the first axis a drive profile of its own, changed."""
+    text = files("profiles").joinpath("drives", "reference.yaml").read_text(encoding="utf-8")
+    profile = yaml.safe_load(text)
+    profile["eds"] = str(files("profiles").joinpath("drives", profile["eds"]))
+    change(profile["parameters"])
+    path = folder.path / "own.yaml"
+    path.write_text(yaml.safe_dump(profile, sort_keys=False))
+    data = yaml.safe_load(folder.machine.read_text())
+    data["axes"][0]["drive"] = str(path)
+    folder.machine.write_text(yaml.safe_dump(data, sort_keys=False))
+
+
+def no_velocity_i(parameters: dict[str, Any]) -> None:
+    del parameters["velocity_i"]
+
+
+def little_velocity_p(parameters: dict[str, Any]) -> None:
+    parameters["velocity_p"] |= {"minimum": 1000.0, "maximum": 2000.0}
+
+
+def doubtful(share: float) -> Callable[[SessionFolder], None]:
+    """Give all masses and springs of the model a standard error."""
+
+    def spoil(folder: SessionFolder) -> None:
+        model = read_model(folder.model)
+        axes = tuple(
+            replace(
+                axis,
+                masses=tuple(replace(one, std=share * one.value) for one in axis.masses),
+                springs=tuple(replace(one, std=share * one.value) for one in axis.springs),
+            )
+            for axis in model.axes
+        )
+        folder.model.unlink()
+        write_model(replace(model, axes=axes), folder.model)
+
+    return spoil
+
+
+@pytest.mark.parametrize(
+    ("spoil", "options", "code", "said"),
+    [
+        (
+            doubtful(0.29),
+            ("--response", "soft", "--bound", "1.14"),
+            3,
+            ("on every machine that the model allows", "Keep the present ones, or try --response"),
+        ),
+        (doubtful(0.4), (), 5, ("table mass 1 is", "is not known", "--time")),
+        (
+            lambda folder: lacking(folder, no_velocity_i),
+            (),
+            0,
+            ("table: its drive profile has no velocity_i that can be written", "maker's software"),
+        ),
+        (
+            lambda folder: lacking(folder, little_velocity_p),
+            (),
+            3,
+            ("ranges are too small: table: velocity_p", "(the drive holds 1000 to 2000 N m s/rad)",
+             "other units or ranges"),
+        ),
+        (
+            lambda folder: folder.parameters_before.write_text("nonsense: ["),
+            (),
+            0,
+            ("table: its present parameters can not be compared", "parameters-before.yaml"),
+        ),
+    ],
+    ids=["margin", "unknown", "parameter", "ranges", "unreadable"],
+)  # fmt: skip
+def test_what_stands_against_a_design_is_said_with_what_can_still_be_done(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    spoil: Callable[[SessionFolder], object],
+    options: tuple[str, ...],
+    code: int,
+    said: tuple[str, ...],
+) -> None:
+    folder = session(tmp_path, ("reference", "reference"))
+    spoil(folder)
+    assert main_code(["design", str(folder.path), *options]) == code
+    told = capsys.readouterr()
+    text = " ".join((told.out + told.err).split())
+    for words in said:
+        assert words in text
+    assert folder.tuning.is_file() == (code == 0)
