@@ -5,16 +5,20 @@ statusword, actual position, actual torque.
 """
 
 import struct
+from collections import deque
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from math import ceil, floor, sqrt
 
 import can
 
+from drives.canopen_drive.answer import Reversed
 from drives.canopen_drive.drive import CanopenDrive
 from drives.canopen_drive.line import NMT_OPERATIONAL
 from drives.canopen_drive.setup import DRIVE_HEARTBEAT
 from drives.canopen_drive.unseen import FLOOR, Unseen
 from drives.cia402 import ENABLED_MASK, ENABLED_VALUE, PowerState, emergency_text
+from drives.profile import CouplingProfile
 
 OUTPUT = struct.Struct("<Hih")
 INPUT = struct.Struct("<Hih")
@@ -42,6 +46,11 @@ may need that much."""
 STUCK_SLOWEST = 10.0
 """Natural frequency of the slowest position loop, rad/s: it is given the time to drive an axis that
 reverses on across one unit of its encoder."""
+SHAKEN_CYCLES, SHAKEN_UNITS, SHAKEN_STAYS = 6, 2, 0.9
+"""Cycles over which the change of an axis' speed is taken that others may feel, and position units of it
+that may be rounding; and the share of it that counts a cycle later."""
+COUPLED = 1.5
+"""Times a coupling of the machine profile that there may be."""
 _MOST_UNITS = 2**33
 """More position units than any change or error of a 32-bit position can have."""
 
@@ -106,6 +115,15 @@ class Channel:
     """Torque offset sent last, per mille of the rated torque."""
     unseen: Unseen | None = None
     """Looks for motion that the encoder does not show; None for a floating axis."""
+    others: list[tuple["Channel", float]] = field(default_factory=list)
+    """Axes that are coupled with it, and the torque units by which they may hold it for each position
+    unit per cycle and cycle that they accelerate."""
+    shaken: float = 0.0
+    """Acceleration of late, position units per cycle and cycle."""
+    places: deque[int] = field(default_factory=lambda: deque(maxlen=2 * SHAKEN_CYCLES + 1))
+    """Positions of the last cycles, without a gap."""
+    turned: Reversed | None = None
+    """Looks for a motor that turns against its torque; None for a floating axis."""
 
     @property
     def state(self) -> PowerState | None:
@@ -133,6 +151,7 @@ class Channel:
             self.anchor, self.still = None, 0
         self._judge_jump()
         cycles = 1 + self.missing + self.paused
+        self._note_shaking(cycles)
         self._judge_unseen(torque, cycles)
         self.allowed = ceil(self.step * cycles)
         self._judge_span(cycles)
@@ -149,13 +168,27 @@ class Channel:
                 self.jumped, self.jumped_ago = change, JUMP_CYCLES
         self.step_before = step if even else None
 
+    def _note_shaking(self, cycles: float) -> None:
+        if cycles != 1:
+            self.places.clear()
+        self.places.append(self.position)
+        self.shaken *= SHAKEN_STAYS
+        if len(self.places) == self.places.maxlen:
+            change = self.places[-1] - 2 * self.places[SHAKEN_CYCLES] + self.places[0]
+            sure = max(0, abs(change) - SHAKEN_UNITS) / SHAKEN_CYCLES**2
+            self.shaken = max(self.shaken, sure)
+
     def _judge_unseen(self, torque: int, cycles: float) -> None:
-        if self.unseen is None:
+        if self.unseen is None or self.turned is None:
             return
         if self.statusword & ENABLED_MASK != ENABLED_VALUE:
             self.unseen.restart()
+            self.turned.restart()
         else:
-            self.unseen.take(self.position, torque, cycles)
+            disturbed = sum(other.shaken * torques for other, torques in self.others)
+            self.unseen.take(self.position, torque, cycles, disturbed)
+            friction = self.drive.learned.friction
+            self.turned.take(self.position, torque, cycles, friction)
 
     def _judge_span(self, cycles: float) -> None:
         if self.span_begin is None:
@@ -168,7 +201,9 @@ class Channel:
 
     @property
     def alarm(self) -> str:
-        """What makes it sure that the axis moves unseen, or was caught; else empty."""
+        """What makes it sure that the axis moves unseen, was caught, or is reversed; else empty."""
+        if self.turned is not None and self.turned.alarm:
+            return "reversed"
         return self.unseen.alarm if self.unseen is not None else ""
 
     def is_stuck(self, target: int) -> bool:
@@ -252,6 +287,13 @@ class Channel:
                 f"{drive.axis}: following error {error:.4g} {unit} is above the limit "
                 f"{limits.following_error:g} {unit}; all axes were stopped. Does the axis move the "
                 "wrong way, or is it blocked?"
+            )
+        if self.turned is not None and self.turned.alarm:
+            return (
+                f"{drive.axis}: its motor turns against its torque, as it did not before "
+                f"({torque * scale.torque:.3g} {torque_unit} told now); its power was cut and all axes "
+                "were stopped. Check the motor's phases and the encoder's direction: a wire or a "
+                "setting of the drive has changed in motion."
             )
         if self.unseen is not None and self.alarm:
             return self._unseen_words(self.unseen)
@@ -344,7 +386,23 @@ def channel_of(
         unseen=None
         if free
         else Unseen(drive.learned, push, window, floor_torque, cycle_time, wind_up),
+        turned=None
+        if free
+        else Reversed(drive.answer, push, limits.torque / scale.torque, cycle_time),
     )
+
+
+def couple(
+    channels: Sequence[Channel], couplings: Iterable[CouplingProfile], cycle_time: float
+) -> None:
+    """Let coupled axes know of each other: what accelerates one may hold the other."""
+    by_axis = {channel.drive.axis: channel for channel in channels}
+    for coupling in couplings:
+        a, b = (by_axis[axis] for axis in coupling.axes)
+        for one, other in ((a, b), (b, a)):
+            inertia = COUPLED * abs(coupling.value) / cycle_time**2
+            scale = other.drive.scaling.position / one.drive.scaling.torque
+            one.others.append((other, inertia * scale))
 
 
 def _stuck_time(window: int) -> float:

@@ -12,6 +12,7 @@ from canopen.sdo import SdoAbortedError, SdoCommunicationError
 from drives import objects
 from drives.api import AxisLimits, DriveIdentity
 from drives.bus import drives_begin_anew
+from drives.canopen_drive.answer import Answer
 from drives.canopen_drive.conversion import Conversion, quantity_objects
 from drives.canopen_drive.line import Line, Node
 from drives.canopen_drive.scaling import Scaled, read_scaling
@@ -61,6 +62,8 @@ class CanopenDrive:
         """Whether something that was set for a time could not be put back."""
         self.learned = Learned()
         """What its motion has shown so far; learned while it moves."""
+        self.answer = Answer()
+        """How it has answered its torques so far; learned while it moves."""
 
     @property
     def axis(self) -> str:

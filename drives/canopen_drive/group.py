@@ -192,6 +192,7 @@ class CanopenGroup:
                 offsets,
                 sync,
                 watch,
+                self.machine.couplings,
             )
             motion.perhaps_enabled = unsure
             motion.onlooker = self.onlooker

@@ -5,7 +5,7 @@ disabled once they stand; the power of one that runs away is cut at once, becaus
 loop of the wrong sign would only make it faster.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 
 import can
@@ -13,7 +13,7 @@ import numpy as np
 
 from drives import objects
 from drives.api import Capture, FloatArray, MotionWatch, Onlooker, Source, Targets, joined
-from drives.canopen_drive.channel import INPUT, OUTPUT, Channel, channel_of
+from drives.canopen_drive.channel import INPUT, OUTPUT, Channel, channel_of, couple
 from drives.canopen_drive.drive import CanopenDrive
 from drives.canopen_drive.interrupts import uninterrupted
 from drives.canopen_drive.line import Line
@@ -32,6 +32,7 @@ from drives.errors import (
     StoppedError,
     UserStopError,
 )
+from drives.profile import CouplingProfile
 
 NMT_STOPPED = 4
 INPUT_ROW = np.dtype([("statusword", "<u2"), ("position", "<i4"), ("torque", "<i2")])
@@ -65,12 +66,14 @@ class CanopenMotion:
         offsets: frozenset[str] = frozenset(),
         sync: Sync | None = None,
         watch: MotionWatch | None = None,
+        couplings: Iterable[CouplingProfile] = (),
     ) -> None:
         self._line, self._cycle_time, self._stop_requested = line, cycle_time, stop_requested
         self._watch = watch
         self._channels = [
             channel_of(d, cycle_time, d.axis in free, d.axis in offsets) for d in drives
         ]
+        couple(self._channels, couplings, cycle_time)
         self._by_cob = {0x180 + c.drive.node_id: k for k, c in enumerate(self._channels)}
         self._by_node = {c.drive.node_id: c for c in self._channels}
         self._sync: Sync = sync or HostSync(line, cycle_time)

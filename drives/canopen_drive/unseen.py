@@ -17,7 +17,7 @@ from collections import deque
 from dataclasses import dataclass
 from statistics import median
 
-DEAD_UNITS, LEAST_UNITS = 16, 32
+DEAD_UNITS, LEAST_UNITS = 16, 24
 """Position units that may be unseen in any case: of an axis that stands dead, and of one at rest."""
 LEARN_UNITS = 12
 """Those from which friction must have held an axis that moves again: a reversal between two counts comes
@@ -39,8 +39,10 @@ LAST_STEP, STEP_BEFORE, DEAD_SHARE = 1.5, 2.5, 1.5
 friction stops; and that may be unseen."""
 SWING = 2.0
 """Times that way by which a load may swing."""
-HOLDS = 9
-"""Times that an axis broke loose whose median torque is its friction."""
+HOLDS, SURE_HOLDS, KEPT = 9, 5, 0.75
+"""Times that an axis broke loose whose median torque is its friction; the least whose median is
+remembered, and the share of the largest such median that stays: an axis that trembles slips away
+under less, again and again."""
 FRICTION_SHARE, FLOOR = 1.8, 0.03
 """Friction may hold an axis against so many times what was learned, and this share of the torque
 limit."""
@@ -66,6 +68,8 @@ class Learned:
     """Mean direction of that motion, -1 to 1: its share of friction is in the mean torque."""
     cycle_time: float = 0.0
     """s, of the motion in which the next was seen."""
+    most: float = 0.0
+    """Largest friction so far."""
     change: float = 0.0
     """Largest change of a step from one cycle to the next."""
     samples: int = 0
@@ -74,11 +78,13 @@ class Learned:
     @property
     def friction(self) -> float:
         """The torque that friction holds it against, usually."""
-        return median(self.holds) if self.holds else 0.0
+        return max(median(self.holds), KEPT * self.most) if self.holds else 0.0
 
     def note_hold(self, torque: float) -> None:
         """Learn that it stood under a torque, and then broke loose."""
         self.holds = (*self.holds[1 - HOLDS :], torque)
+        if len(self.holds) >= SURE_HOLDS:
+            self.most = max(self.most, median(self.holds))
 
     @property
     def pull(self) -> float:
@@ -132,7 +138,7 @@ class Unseen:
         self._step = self._step_before = 0.0
         self._stood = 0
         self._coasting = self._doubtful = False
-        self._speed = self._pushed = 0.0
+        self._speed = self._pushed = self._disturbed = 0.0
         self.way = 0.0
         """How far it has gone unseen, position units; signed."""
         self.alarm = ""
@@ -152,8 +158,13 @@ class Unseen:
         """Begin anew: time has passed unseen, or nothing pushes the axis."""
         self._position = None
 
-    def take(self, position: int, torque: int, cycles: float = 1.0) -> None:
-        """Take the next sample, which comes so many cycles after the one before."""
+    def take(self, position: int, torque: int, cycles: float = 1.0, disturbed: float = 0.0) -> None:
+        """Take the next sample, which comes so many cycles after the one before.
+
+        ``disturbed`` is the torque that other axes may hold it by, through couplings: not for long, for
+        they swing.
+        """
+        self._disturbed = disturbed if self._stood < self._count else 0.0
         if cycles > self._bridged:
             self.restart()
         before, self._position = self._position, position
@@ -256,7 +267,7 @@ class Unseen:
             if self._stood >= STOOD and abs(self.way) > self.dead:
                 self.alarm = "dead"
             return
-        hold = FRICTION_SHARE * friction + self._floor
+        hold = FRICTION_SHARE * friction + self._floor + self._disturbed
         if abs(pushed) > hold:
             self._speed += push * (pushed - hold if pushed > 0 else pushed + hold)
         else:  # it may have been caught again

@@ -1,4 +1,4 @@
-"""Sound machines of all kinds are measured: does what watches for stuck encoders stay quiet?
+"""Sound machines of all kinds are measured: does what watches for encoders and motors stay quiet?
 
 Random machines of two coupled axes: dry friction up to a fifth of the torque limit (Coulomb, Stribeck),
 backlash, encoders of 2000 to 8 million counts a turn, soft and stiff springs, slow and fast loops, noisy
@@ -8,9 +8,9 @@ errors.  Each is measured by the fast plan on the lock-step bus, as a user would
 machine the watch does not get 4 % of the samples, as on a bus that loses cycles.
 
 A false alarm is exit code 4, but for a torque above its limit, which is true where it is said.
-``dead`` and ``pushed`` are the worst shares of the watch's bounds that sound axes came to: 1 is an
-alarm.  Loops are stiff enough to move their axis against its friction, as a drive that was set up once
-is.
+``dead``, ``pushed`` and ``reversed`` are the worst shares of the watches' bounds that sound axes came
+to: 1 is an alarm (of ``reversed`` where the reversed model also leaves little).  Loops are stiff enough
+to move their axis against its friction, as a drive that was set up once is.
 
 Target: no false alarm.
 
@@ -31,6 +31,7 @@ import yaml
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
+from drives.canopen_drive.answer import DECIDES, Reversed
 from drives.canopen_drive.unseen import STOOD, Unseen
 from drives.profile import load_machine
 from drives.sim.lockstep_bus import register, unregister
@@ -44,7 +45,7 @@ WIDEST = 0.015
 """rad by which friction may hold an axis beside its target."""
 LOST = 0.04
 """Share of the samples that the watch does not get, of every second machine."""
-worst = {"dead": 0.0, "pushed": 0.0}
+worst = {"dead": 0.0, "pushed": 0.0, "reversed": 0.0}
 
 
 def _one_thing_more(rng: np.random.Generator) -> dict[str, Any]:
@@ -148,10 +149,10 @@ def main() -> int:
         seed = int(np.random.SeedSequence().generate_state(1)[0])
     print(f"seed {seed}, {given.machines} machines", flush=True)
     loses = _note_shares(np.random.default_rng([seed, given.machines]))
-    began, false, most, codes = time.process_time(), 0, [0.0, 0.0], []
+    began, false, most, codes = time.process_time(), 0, [0.0, 0.0, 0.0], []
     for k in range(given.machines):
         profile, said = random_machine(np.random.default_rng([seed, k]))
-        worst.update(dead=0.0, pushed=0.0)
+        worst.update(dead=0.0, pushed=0.0, reversed=0.0)
         loses[0] = LOST * (k % 2)
         said += ", cycles lost" * (k % 2)
         code, text = _measured(profile, f"sound-{k}")
@@ -165,7 +166,7 @@ def main() -> int:
             print(f"      {text[:300]}", flush=True)
     print(
         f"{given.machines} sound machines, {false} false alarms, {codes.count(0)} measured to the end; "
-        f"worst share of the bounds: dead {most[0]:.2f}, pushed {most[1]:.2f}; "
+        f"worst share of the bounds: dead {most[0]:.2f}, pushed {most[1]:.2f}, reversed {most[2]:.2f}; "
         f"{time.process_time() - began:.0f} s of CPU"
     )
     return int(false > 0 or 1 in codes)
@@ -186,7 +187,14 @@ def _note_shares(rng: np.random.Generator) -> list[float]:
         elif not self._coasting and self.knows:
             worst["pushed"] = max(worst["pushed"], abs(self.way) / self.at_rest)
 
+    taken = Reversed.take
+
+    def noted_too(self: Reversed, *sample: Any) -> None:
+        taken(self, *sample)
+        worst["reversed"] = max(worst["reversed"], self.total / DECIDES)
+
     Unseen.take = noted  # type: ignore[method-assign]
+    Reversed.take = noted_too  # type: ignore[method-assign]
     return loses
 
 

@@ -33,6 +33,7 @@ from drives.sim.state_machine import State
 from fieldtool.cli.main import main
 from fieldtool.errors import FieldtoolError
 from fieldtool.records.recording import load
+from tests.faults.clairvoyant import Received, Verdict, verdict
 from tests.session.conftest import PROCESS_VALUES, two_axes
 from tests.untried import Stood
 
@@ -111,6 +112,8 @@ class Result:
     """Whether a drive was enabled again after all had reacted."""
     restored: str
     """What was wrong with `fieldtool restore`, where something was left to be put back; else empty."""
+    best: Verdict | None = None
+    """When somebody who knows all of the machine could have known; None where it was not asked."""
 
     def cycles(self, *without: int) -> float:
         """Cycles until every drive that was on had left operation enabled."""
@@ -129,6 +132,7 @@ class Bench:
         node: int = ARM,
         profile: dict[str, Any] | None = None,
         objects: Mapping[int, Mapping[tuple[int, int], Any]] | None = None,
+        factor: float | None = None,
     ) -> None:
         self.folder, self.moment, self.node = folder, moment, node
         self._faults = faults(node)
@@ -143,6 +147,8 @@ class Bench:
         )
         self.machine: RunningMachine = register(self.channel, replace(described, drives=drives))
         self.before = {n.node_id: self._objects(n) for n in self.machine.nodes}
+        self._factor = factor
+        self._received = Received(self.machine) if factor is not None else None
         self.watch = Watch()
         self._frames = self._requests = self._still = self._moving = self._writes = 0
         self._motions, self._on = 0, False
@@ -257,6 +263,7 @@ class Bench:
     def _result(self, code: int, said: str) -> Result:
         rows, complete = self._recorded()
         nodes = self.machine.nodes
+        best = self._best()
         changed = self._all_changed()
         gains = {n.node_id: self._kind(n, n.dictionary.read) for n in nodes}
         stored = {n.node_id: self._kind(n, self._after_power_cycle(n)) for n in nodes}
@@ -274,7 +281,16 @@ class Bench:
             still_on,
             self._enabled_again,
             self._restored() if self._is_left(code, changed) else "",
+            best,
         )
+
+    def _best(self) -> Verdict | None:
+        if self._received is None or self._factor is None or self.watch.fault_time is None:
+            return None
+        if self.moment not in (Moment.STILL, Moment.SWEEP):
+            return None
+        axis = self.machine.node(self.node).axis
+        return verdict(self._received, self.watch.fault_time, axis, self._factor)
 
     def _is_left(self, code: int, changed: Mapping[int, Mapping[str, Any]]) -> bool:
         if self.moment is Moment.WRITE:

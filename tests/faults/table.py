@@ -49,6 +49,7 @@ from drives.sim.frame_faults import (
 )
 from drives.sim.host_faults import BusOff, HostKilled, HostStalls, InterfaceDown, ReceiverDead
 from tests.faults.bench import ARM, TABLE, Moment, Result, try_case
+from tests.faults.clairvoyant import HELD
 from tests.session.conftest import two_axes
 
 CYCLES = 3.0
@@ -124,6 +125,9 @@ class Row:
     write: Expected
     profile: Callable[[], dict[str, Any]] = two_axes
     """The machine."""
+    factor: float | None = None
+    """What the fault makes of the torque that the drive tells, where only motion shows it: asked of the
+    clairvoyant."""
 
     def expected(self, moment: Moment) -> Expected:
         """Return what has to come at a moment."""
@@ -236,7 +240,7 @@ def _still(
     """Return a fault that shows only when the motor must have moved: the position stands still."""
     said = "arm: does not move by its encoder: .*brake"
     asked = stopped(said, unseen=unseen, cycles=asked_within)
-    return Row(name, _one(fault), asked, asked, sweep, NOT_IN_USE, profile)
+    return Row(name, _one(fault), asked, asked, sweep, NOT_IN_USE, profile, HELD)
 
 
 ROWS: tuple[Row, ...] = (
@@ -472,8 +476,9 @@ ROWS: tuple[Row, ...] = (
         _one(MotorReversed),
         stopped("arm: .*the wrong way", farthest=FAR),
         stopped("arm: .*the wrong way", cycles=300, farthest=FAR),
-        stopped("arm: .*above the limit", cycles=100),
+        stopped("arm: its motor turns against its torque", cycles=15, unseen=0.01, farthest=FAR),
         NOT_IN_USE,
+        factor=-1.0,
     ),
     Row(
         "torque scale times ten",
@@ -482,6 +487,7 @@ ROWS: tuple[Row, ...] = (
         seen_late("arm: by its torque .*a factor of .*0x6076", farthest=FAR),
         stopped("arm: torque .* is above the limit 6 N m", cycles=80, farthest=FAR),
         NOT_IN_USE,
+        factor=0.1,
     ),
     Row(
         "torque scale by ten",
@@ -490,6 +496,7 @@ ROWS: tuple[Row, ...] = (
         seen_late("arm: .*torque .*0x6076", (4, 5), farthest=FAR),
         seen_late("arm: .*torque .*0x6076", (4, 5), farthest=FAR),
         NOT_IN_USE,
+        factor=10.0,
     ),
     _still("brake closed", BrakeClosed, stopped(DEAD, unseen=1e-6), 1e-6),
     Row(
@@ -577,7 +584,7 @@ ROWS: tuple[Row, ...] = (
 
 def try_row(row: Row, moment: Moment) -> Result:
     """Bring one fault about at one moment."""
-    return try_case(moment, row.make, profile=row.profile())
+    return try_case(moment, row.make, profile=row.profile(), factor=row.factor)
 
 
 def problems(result: Result, expected: Expected, moment: Moment) -> list[str]:

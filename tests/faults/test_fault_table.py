@@ -9,12 +9,14 @@ import os
 import numpy as np
 import pytest
 
-from tests.faults.bench import Moment
+from tests.faults.bench import Moment, try_case
+from tests.faults.clairvoyant import HELD
 from tests.faults.table import ROWS, Row, problems, try_row
 from tests.seeds import fresh_seed
 
 WENT_WRONG_ONCE = {
     ("encoder stuck", Moment.STILL),
+    ("motor reversed", Moment.SWEEP),
     ("mode changes, to profile position", Moment.SWEEP),
     ("mode changes, to cyclic torque", Moment.SWEEP),
     ("stranger: targets", Moment.SWEEP),
@@ -62,3 +64,17 @@ def test_faults_end_well_at_every_moment(part):
             for problem in problems(result, row.expected(moment), moment)
         ]
     assert not wrong, "\n".join(wrong)
+
+
+def test_the_clairvoyant_is_sooner_than_the_tool_and_sees_nothing_where_nothing_is():
+    row = next(row for row in ROWS if row.name == "motor reversed")
+    result = try_row(row, Moment.SWEEP)
+    assert result.best is not None
+    assert result.best.visible is not None
+    assert result.best.decided is not None
+    assert 1 <= result.best.visible <= result.best.decided <= result.cycles()
+    for factor in (-1.0, HELD):
+        sound = try_case(Moment.SWEEP, lambda _: (), factor=factor)
+        assert sound.code == 0
+        assert sound.best is not None
+        assert sound.best.decided is None, factor
