@@ -297,6 +297,17 @@ def _judged(rows: list[dict[str, Any]]) -> None:
         f"settling against prediction: within 15 % (or 3 cycles) {sum(o <= TIME_OFF for o in apart)} of "
         f"{len(apart)}, worst {100 * max(apart):.2g} %"
     )
+    latest = _pairs(axes, "predicted", "settling_latest")
+    said = [max(p, b if np.isfinite(b) else 0.0) for p, b in zip(predicted, latest, strict=True)]
+    inside = [
+        p - max(TIME_OFF * p, s) <= a <= b + max(TIME_OFF * b, s)
+        for a, p, b, s in zip(after, predicted, said, slack, strict=True)
+    ]
+    later = sum(b > p for p, b in zip(predicted, said, strict=True))
+    print(
+        f"  up to the later time that is told where a swing touches the band's edge ({later} axes): "
+        f"{sum(inside)} of {len(inside)}"
+    )
     print(f"seconds a machine: median {np.median([row['seconds'] for row in rows]):.0f}")
 
 
