@@ -176,12 +176,14 @@ def _note_shares(rng: np.random.Generator) -> list[float]:
     """Note how near the watch comes to its bounds; return the share of samples it loses, to be set."""
     take, loses, lost = Unseen.take, [0.0], dict[int, float]()
 
-    def noted(self: Unseen, position: int, torque: int, cycles: float = 1.0) -> None:
+    def noted(
+        self: Unseen, position: int, torque: int, cycles: float = 1.0, disturbed: float = 0.0
+    ) -> None:
         cycles += lost.pop(id(self), 0.0)
         if rng.random() < loses[0]:
             lost[id(self)] = cycles
             return
-        take(self, position, torque, cycles)
+        take(self, position, torque, cycles, disturbed)
         if self._coasting and self._stood >= STOOD:
             worst["dead"] = max(worst["dead"], abs(self.way) / self.dead)
         elif not self._coasting and self.knows:
