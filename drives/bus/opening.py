@@ -11,7 +11,7 @@ from drives.bus.adapters import (
     missing_package,
 )
 from drives.bus.kernel_link import KernelLink, kernel_links
-from drives.errors import BusError
+from drives.errors import BusError, ProfileError
 from drives.profile import BusProfile
 
 SOCKETCAN = "socketcan"
@@ -28,6 +28,8 @@ def open_bus(profile: BusProfile) -> can.BusABC:
     BusError
         If python-can knows no such interface or option, a driver or package is missing, the
         interface is missing, down or has another bit rate, or it can not be opened.
+    ProfileError
+        If the machine that it would simulate can not be.
     """
     if profile.interface == SOCKETCAN:
         check_link(profile)
@@ -48,6 +50,9 @@ def open_bus(profile: BusProfile) -> can.BusABC:
     except BusError:
         raise
     except Exception as error:  # adapters' libraries raise whatever they like
+        cause = error.__cause__
+        if isinstance(cause, ProfileError) and cause.path.is_file():
+            raise cause from None
         raise BusError(_why_not(profile, error)) from error
     return opened
 

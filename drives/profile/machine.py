@@ -131,7 +131,7 @@ class AxisProfile(Part):
         if not isinstance(data, dict) or not isinstance(data.get("limits"), dict):
             return data
         kind = data.get("kind")
-        if kind not in DIMENSIONS:
+        if not isinstance(kind, str) or kind not in DIMENSIONS:
             return data
         dimension = DIMENSIONS[kind]
         of_key = {

@@ -42,6 +42,9 @@ class ReplayBus(can.BusABC):
         If an option is not known.
     """
 
+    of_this_process = True
+    """No other process can have to do with it."""
+
     def __init__(
         self,
         channel: Channel | None = None,

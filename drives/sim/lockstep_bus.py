@@ -162,6 +162,9 @@ class LockstepBus(can.BusABC):
     not_imitated = NOT_IMITATED
     """What differs from a real bus, for whoever reports results; see :data:`NOT_IMITATED`."""
 
+    of_this_process = True
+    """No other process can have to do with it."""
+
     def __init__(
         self,
         channel: Channel | None = None,

@@ -21,6 +21,7 @@ from fieldtool.experiment.multisine.design import fast_cycle_times
 from fieldtool.workflow.check_moves import MOVE_CHECKS, MoveChecks
 from fieldtool.workflow.check_still import check_still
 from fieldtool.workflow.models import prior_model
+from fieldtool.writeback.alone import alone_on
 
 PACE_TIME = 1.0
 """Seconds for which it is tried whether this computer keeps the cycle."""
@@ -124,6 +125,10 @@ class _Check:
 
     def run(self, trace: Path | None) -> CheckResult:
         """Check what can be checked, in order; return all findings."""
+        with alone_on(self._machine.bus):
+            return self._checked(trace)
+
+    def _checked(self, trace: Path | None) -> CheckResult:
         findings = self._findings
         try:
             opened = open_bus(self._machine.bus)

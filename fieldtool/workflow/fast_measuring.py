@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from drives.canopen_drive import CanopenGroup, connect
+from drives.canopen_drive import CanopenGroup
 from drives.errors import StoppedError, UserStopError
 from drives.profile import MachineProfile, load_machine
 from fieldtool.experiment.axes import Axes
@@ -48,6 +48,7 @@ from fieldtool.workflow.preparation import (
 from fieldtool.workflow.rescued import keeping
 from fieldtool.workflow.session import Options, Screen, Session
 from fieldtool.workflow.stopped import check_loops, judge_stop
+from fieldtool.writeback.alone import connected
 from fieldtool.writeback.temporary import backed_up
 
 GUESSED_NOISE = 1e-3
@@ -82,7 +83,7 @@ def plan(
     """
     profile = machine if isinstance(machine, MachineProfile) else load_machine(machine)
     options = options or Options()
-    with connect(profile) as group, group.without_feed_forward():
+    with connected(profile) as group, group.without_feed_forward():
         setting = setting_of(profile, group, prior_model(profile))
         cycle_time = fast_cycle_times(setting.model, group.shortest_cycle)[0]
         times = timing(setting, options.excitation_time or usual_seconds(setting.model))

@@ -1,6 +1,7 @@
 """What is on a bus, and how it compares with a machine profile."""
 
 from collections.abc import Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ from drives.scan import Scan, ScannedNode
 from drives.scan import scan as scan_bus
 from drives.scan.scanning import LISTEN, Progress
 from drives.trace import traced
+from fieldtool.writeback.alone import alone_on
 
 
 @dataclass(frozen=True)
@@ -77,18 +79,23 @@ def scan(
         If a drive profile that the machine names is wrong.
     BusError
         If the bus can not be opened, or does not take frames.
+    UnfinishedWriteError
+        If another process of the tool uses it.
     """
     profiles = {name: load_drive(name) for name in packaged("drives")}
     if machine is not None:
         for axis in machine.axes:
             one = load_drive(axis.drive, machine.path)
             profiles[one.name] = one
-    opened = open_bus(bus)
-    try:
-        with traced(opened, trace) as used:
-            found = scan_bus(used, bus.bitrate, profiles, listen=listen, ask=ask, progress=progress)
-    finally:
-        opened.shutdown()
+    with nullcontext() if ask is False else alone_on(bus):
+        opened = open_bus(bus)
+        try:
+            with traced(opened, trace) as used:
+                found = scan_bus(
+                    used, bus.bitrate, profiles, listen=listen, ask=ask, progress=progress
+                )
+        finally:
+            opened.shutdown()
     remarks = () if machine is None else compared_with(machine, found, profiles)
     return ScanResult(bus, found, machine, remarks)
 

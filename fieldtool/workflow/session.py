@@ -10,7 +10,7 @@ from typing import Any, Literal, Protocol
 import yaml
 
 from drives.bus import not_imitated
-from drives.canopen_drive import CanopenGroup, connect
+from drives.canopen_drive import CanopenGroup
 from drives.parameters import Change, Written
 from drives.profile import MachineProfile, load_machine
 from drives.trace import trace_problem
@@ -27,6 +27,7 @@ from fieldtool.records.session_folder import SessionFolder
 from fieldtool.records.yaml_file import write_yaml
 from fieldtool.workflow.planning import PlannedFast
 from fieldtool.workflow.verified import Verified
+from fieldtool.writeback.alone import connected
 from fieldtool.writeback.transaction import WriteBack
 from fieldtool.writeback.unfinished import refuse_unfinished
 
@@ -238,7 +239,7 @@ def open_session(
     )
     session.screen.stage(f"Connect to {profile.name}")
     try:
-        with connect(profile, stop_requested=stop_requested, trace=options.trace) as group:
+        with connected(profile, stop_requested=stop_requested, trace=options.trace) as group:
             refuse_unfinished(profile.name, group.drives, folder.path)
             for drive in group.drives:
                 identity = drive.identity

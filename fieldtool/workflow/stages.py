@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from drives.bus import not_imitated
-from drives.canopen_drive import CanopenGroup, connect
+from drives.canopen_drive import CanopenGroup
 from drives.errors import ProfileError, UserStopError
 from drives.parameters import Change
 from drives.profile import MachineProfile, load_machine
@@ -49,6 +49,7 @@ from fieldtool.workflow.session import (
     open_session,
 )
 from fieldtool.workflow.writing import written
+from fieldtool.writeback.alone import connected
 from fieldtool.writeback.restoring import Restored, bring_back, source_of
 from fieldtool.writeback.transaction import WriteBack
 
@@ -307,7 +308,7 @@ def restore(
     simulated = simulated_words(profile)
     if simulated:
         screen.say(f"{simulated} {BEGIN_ANEW}")
-    with connect(profile, trace=trace, to_move=False) as group:
+    with connected(profile, trace=trace, to_move=False) as group:
         screen.stage("Bring the old parameters back")
         return bring_back(
             profile.name,

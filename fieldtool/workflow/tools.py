@@ -4,13 +4,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from drives.canopen_drive import connect
 from drives.canopen_drive.group import profile_of
 from drives.objects import ObjectAddress
 from drives.parameters import Change, Raw
 from drives.profile import MachineProfile, load_machine
 from fieldtool.errors import PlanRefusedError
 from fieldtool.workflow.session import Options, Screen, never, open_session, parameter_table
+from fieldtool.writeback.alone import connected
 from fieldtool.writeback.tool_sets import (
     ToolSet,
     ToolSets,
@@ -56,7 +56,7 @@ def keep_tool(
     controller = _controller(profile)
     if session is not None:
         return keep_session(profile.name, name, session, controller)
-    with connect(profile, to_move=False) as group:
+    with connected(profile, to_move=False) as group:
         refuse_unfinished(profile.name, group.drives, tools_folder(profile.name) / name)
         return keep_drives(profile.name, name, group.drives, controller)
 

@@ -1,6 +1,8 @@
 """A few random moments of kill -9, with real processes; ``bench_kill.py`` tries 200 of them."""
 
+import os
 import signal
+import time
 
 import numpy as np
 import pytest
@@ -132,3 +134,46 @@ def test_a_tool_that_is_killed_in_the_trial_leaves_drives_that_stop_and_can_be_r
         now, then = after[node.node_id], before[node.node_id]
         assert {k for k in now if now[k] != then[k]} <= {k for k in now if k[0] in PDOS}
     assert machine.stored() == before
+
+
+@pytest.mark.parametrize("moment", ["connecting", "moving"])
+def test_a_second_tool_on_the_same_bus_is_refused(machine, moment):
+    """At any time, also where nothing is to be heard on the bus; before it sends anything."""
+    frames = []
+
+    def hold(message):
+        frames.append(message.arbitration_id)
+        if (moment == "connecting" or frames.count(0x80) == 200) and not held:
+            held.append(len(frames))
+            os.kill(first.pid, signal.SIGSTOP)  # in real time it would not bear a busy computer
+
+    held = []
+    machine.bus.on_frame = hold
+    first = machine.start("measure", machine.profile, "--yes", "--out", machine.folder / "first")
+    deadline = time.monotonic() + 60
+    while not held:
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    time.sleep(0.1)
+    sent = len(frames)
+    commands = {
+        "connecting": (("scan", machine.profile), ("check", machine.profile, "--yes")),
+        "moving": (
+            ("measure", machine.profile, "--yes", "--out", machine.folder / "second"),
+            ("restore", machine.folder / "first"),
+        ),
+    }
+    for words in commands[moment]:
+        second = machine.run(*words)
+        said = " ".join(second.text.split())
+        assert second.code == 3, said
+        assert said.count("fieldtool: ") == 1, said
+        assert "another fieldtool is at work on" in said
+    assert len(frames) == sent, "nothing was sent"
+    first.kill()
+    first.wait()
+    machine.bus.on_frame = lambda _: None
+    if moment == "moving":
+        machine.ask(lambda: machine.machine.advance_to(machine.machine.time + 1_000_000_000))
+        restored = machine.run("restore", machine.folder / "first")
+        assert restored.code == 0, restored.text

@@ -28,6 +28,8 @@ from fieldtool.experiment.forecast import forecast
 from fieldtool.experiment.stepped.design import chosen_cycle_time, classic_plan
 from fieldtool.workflow.models import prior_model
 from fieldtool.workflow.preparation import setting_of
+from tests.faults.bench import command as run_command
+from tests.session.conftest import two_axes
 
 TABLE, ARM = 11, 12
 NO_OBJECT = 0x06020000
@@ -600,3 +602,18 @@ def test_nothing_moves_where_nobody_can_be_asked(bench) -> None:
         assert "nobody to ask" in outcome.err
         assert "--yes" in outcome.err
         assert bench.powered() == {}
+
+
+@pytest.mark.parametrize("words", [("measure", "--yes"), ("check", "--yes"), ("scan",)])
+def test_a_machine_that_can_not_be_simulated_is_a_fault_of_its_profile(tmp_path, words):
+    """Exit code 2, as for any other fault in it, though it shows as the bus is opened."""
+    profile, path = two_axes(), tmp_path / "machine.yaml"
+    profile["simulation"]["axes"][0]["peak_torque"] = 1e9
+    profile["bus"]["channel"] = str(path)
+    path.write_text(yaml.safe_dump(profile), encoding="utf-8")
+    command, *options = words
+    out = ("--out", tmp_path / "session") if command == "measure" else ()
+    code, said = run_command(command, path, *options, *out)
+    assert code == 2
+    assert "machine.yaml: simulation: " in said
+    assert "peak torque" in said
