@@ -9,7 +9,6 @@ from drives.canopen_drive.drive import CanopenDrive
 from drives.canopen_drive.setup import (
     COAST,
     DRIVE_HEARTBEAT,
-    HOST_LOST_AFTER,
     HOST_NODE_ID,
     QUICK_STOP_RAMP,
     TemporaryObjects,
@@ -18,9 +17,12 @@ from drives.errors import NotSupportedError
 from drives.objects import ObjectAddress, ObjectInfo
 from drives.profile import UNKNOWN
 
-HOST_WATCHED = (HOST_NODE_ID << 16) | round(HOST_LOST_AFTER * 1000)
-"""Entry of 0x1016: the host's heartbeat may stay away for so many milliseconds."""
 _GUARD_TIME = ObjectInfo(ObjectAddress(0x100C), "UNSIGNED16", "guard time")
+
+
+def host_watched(seconds: float) -> int:
+    """Return the entry of 0x1016 by which the host's heartbeat may stay away for so long."""
+    return (HOST_NODE_ID << 16) | round(seconds * 1000)
 
 
 def require_fail_safe(drive: CanopenDrive) -> None:
@@ -55,8 +57,8 @@ def require_fail_safe(drive: CanopenDrive) -> None:
         )
 
 
-def arm(drive: CanopenDrive, changes: TemporaryObjects) -> None:
-    """Make the drive stop by itself when the host's heartbeat is lost.
+def arm(drive: CanopenDrive, changes: TemporaryObjects, lost_after: float) -> None:
+    """Make the drive stop by itself when the host's heartbeat is lost for so many seconds.
 
     A quick stop that would let the axis coast (0x605A = 0) becomes a ramp too.
 
@@ -73,10 +75,10 @@ def arm(drive: CanopenDrive, changes: TemporaryObjects) -> None:
             objects.QUICK_STOP_OPTION, QUICK_STOP_RAMP[drive.profile.quick_stop_reaction]
         )
     changes.change(objects.PRODUCER_HEARTBEAT, round(DRIVE_HEARTBEAT * 1000))
-    changes.change(objects.CONSUMER_HEARTBEAT, HOST_WATCHED)
+    changes.change(objects.CONSUMER_HEARTBEAT, host_watched(lost_after))
 
 
-def see_armed(drive: CanopenDrive) -> None:
+def see_armed(drive: CanopenDrive, lost_after: float) -> None:
     """See that everything still is as it was armed: right before the drive is enabled.
 
     Raises
@@ -84,7 +86,8 @@ def see_armed(drive: CanopenDrive) -> None:
     NotSupportedError
         If the drive has changed a value by itself, as by going operational.
     """
-    for info, value in {**_wanted(drive), objects.CONSUMER_HEARTBEAT: HOST_WATCHED}.items():
+    watched = {objects.CONSUMER_HEARTBEAT: host_watched(lost_after)}
+    for info, value in {**_wanted(drive), **watched}.items():
         found = drive.read_int(info)
         if found != value:
             raise NotSupportedError(

@@ -158,6 +158,7 @@ class CanopenGroup:
             If a drive can not be enabled.
         """
         self._check(cycle_time, free)
+        bus = self.machine.bus
         offsets = self._offset_axes(free) if torque_offset else frozenset()
         with ExitStack() as stack:
             for drive in self._drives:
@@ -173,13 +174,13 @@ class CanopenGroup:
             for drive in self._drives:  # last, and so first to be put back
                 changes = setup.TemporaryObjects(drive)
                 stack.callback(self._disarm, changes, drive, unsure)
-                fail_safe.arm(drive, changes)
+                fail_safe.arm(drive, changes, bus.host_lost_after)
             for drive in self._drives:
                 stack.callback(self._leave_operational, drive)
             for drive in self._drives:
                 drive.node.nmt.send_command(START_NODE)
             for drive in self._drives:
-                fail_safe.see_armed(drive)
+                fail_safe.see_armed(drive, bus.host_lost_after)
             sync = self._sync(cycle_time)
             stack.callback(sync.close)
             floating = frozenset(free)
@@ -193,6 +194,7 @@ class CanopenGroup:
                 sync,
                 watch,
                 self.machine.couplings,
+                bus.host_lost_after,
             )
             motion.perhaps_enabled = unsure
             motion.onlooker = self.onlooker

@@ -44,9 +44,6 @@ STOP_TIMEOUT = 5.0
 RUNAWAY_SHARE, RUNAWAY_GROWTH, RUNAWAY_CYCLES = 0.25, 1.25, 3
 """An axis runs away that, for so many cycles of a quick stop, is faster than this share of its
 velocity limit and than it was at the start of the stop times the growth."""
-MOST_LATE = HOST_LOST_AFTER - HOST_HEARTBEAT
-"""Seconds by which a cycle may begin late: drives that miss the host for longer stop by themselves,
-and after such a pause the targets would go on from where the axes have long been at rest."""
 PAUSE_CYCLES, REPLY_TRIES = 3, 3
 """Cycles without SYNC before the drives' replies are timed, and tries to find them in time."""
 REPLY_SHARE = 0.9
@@ -67,7 +64,13 @@ class CanopenMotion:
         sync: Sync | None = None,
         watch: MotionWatch | None = None,
         couplings: Iterable[CouplingProfile] = (),
+        lost_after: float = HOST_LOST_AFTER,
     ) -> None:
+        self._lost_after = lost_after
+        """Seconds without the host's heartbeat after which drives stop by themselves."""
+        self._most_late = lost_after - HOST_HEARTBEAT
+        """Seconds by which a cycle may begin late: after a longer pause the targets would go on from
+        where the axes have long been at rest."""
         self._line, self._cycle_time, self._stop_requested = line, cycle_time, stop_requested
         self._watch = watch
         self._channels = [
@@ -365,7 +368,7 @@ class CanopenMotion:
                 self.perhaps_enabled[drive.axis] = (
                     f"{drive.axis}: node {drive.node_id} {shown} after it was told to switch off: it "
                     "MAY STILL BE ENABLED. It has to stop by itself within "
-                    f"{HOST_LOST_AFTER:g} s, as it misses the host's heartbeat. Use the emergency "
+                    f"{self._lost_after:g} s, as it misses the host's heartbeat. Use the emergency "
                     "stop before you go near it."
                 )
         if self.perhaps_enabled:
@@ -568,11 +571,11 @@ class CanopenMotion:
             channel.rebooted = True
 
     def _check_lateness(self) -> None:
-        if self._sync.lateness > MOST_LATE:
+        if self._sync.lateness > self._most_late:
             raise SafetyStopError(
                 f"this computer stood still for {1000 * self._sync.lateness:.0f} ms; a cycle may begin "
-                f"{1000 * MOST_LATE:.0f} ms late at most. All axes were stopped. Close other programs, "
-                "switch power saving off, and start again.",
+                f"{1000 * self._most_late:.0f} ms late at most. All axes were stopped. Close other "
+                "programs, switch power saving off, and start again.",
                 cycle=self._count - 1,
             )
 

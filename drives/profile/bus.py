@@ -20,6 +20,9 @@ class BusProfile(Part):
     shortest_cycle: Annotated[Seconds, Field(ge=0.001, le=0.01)] = 0.001
     """The tool uses no cycle shorter than this, however short one would fit the bit rate: for a
     computer or an adapter that can not keep up."""
+    host_lost_after: Annotated[Seconds, Field(ge=0.1, le=1.0)] = 0.2
+    """Without the host's heartbeat for so long, drives stop by themselves (0x1016).  For a computer
+    that stands still now and then: an axis in motion goes on for so much longer when it dies."""
     sync: Literal["host", "kernel"] = "host"
     """Who times the SYNC: the tool, or the kernel's broadcast manager (SocketCAN only)."""
 
@@ -37,6 +40,7 @@ class BusProfile(Part):
         if interface is not None and interface != self.interface:
             kept = {"interface": interface, "bitrate": self.bitrate}
             kept |= {"shortest_cycle": f"{self.shortest_cycle * 1000:g} ms"}
+            kept |= {"host_lost_after": f"{self.host_lost_after * 1000:g} ms"}
         if channel is not None:
             kept["channel"] = channel
         if bitrate is not None:
@@ -47,6 +51,7 @@ class BusProfile(Part):
         """Return it as it stands in a file; what is usual is left out."""
         data = self.model_dump(exclude_defaults=True)
         data |= {"interface": self.interface, "bitrate": self.bitrate}
-        if "shortest_cycle" in data:
-            data["shortest_cycle"] = f"{self.shortest_cycle * 1000:g} ms"
+        for key in ("shortest_cycle", "host_lost_after"):
+            if key in data:
+                data[key] = f"{data[key] * 1000:g} ms"
         return data

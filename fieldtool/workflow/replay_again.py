@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from drives.errors import DrivesError
+from drives.errors import DrivesError, UserStopError
 from drives.replay.replay_bus import INTERFACE
 from fieldtool.errors import FieldtoolError, FileFormatError
 from fieldtool.records.recording import Experiment, load
@@ -42,8 +42,8 @@ def again(source: Source, out: Path, screen: Screen | None = None) -> Again:
     ------
     FileFormatError
         If the trace is in no session folder, or the session was no ``run`` or ``measure``.
-    DrivesError, FieldtoolError
-        As the command itself, where it is not for a frame that differs.
+    UserStopError
+        If the user stops it now.
     """
     folder, machine = source.trace.parent, source.machine
     if machine is None:
@@ -59,6 +59,8 @@ def again(source: Source, out: Path, screen: Screen | None = None) -> Again:
                 run(played, out, options, screen=screen, confirm=lambda _: wrote)
             else:
                 measure(played, out, options, screen=screen)
+    except UserStopError:
+        raise
     except (DrivesError, FieldtoolError) as error:
         problem = str(error)
     before = SessionFolder(folder).recording

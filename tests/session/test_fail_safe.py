@@ -3,7 +3,8 @@
 import pytest
 import yaml
 
-from drives.canopen_drive.fail_safe import HOST_WATCHED
+from drives.canopen_drive.fail_safe import host_watched
+from drives.canopen_drive.setup import HOST_LOST_AFTER
 from drives.errors import NotSupportedError
 from drives.sim.faults import SdoRefused
 
@@ -83,7 +84,7 @@ def test_it_is_armed_in_motion_and_put_back_after(bench):
         with group.motion(0.002):
             for node in bench.machine.nodes:
                 read = node.dictionary.read
-                assert read(0x1016, 1) == HOST_WATCHED
+                assert read(0x1016, 1) == host_watched(HOST_LOST_AFTER)
                 assert (read(0x6007, 0), read(0x1029, 1), read(0x605A, 0)) == (3, 1, 2)
         assert bench.objects() == before
 
