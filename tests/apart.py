@@ -195,6 +195,7 @@ class MachineApart:
                 "interface": "socketcand",
                 "channel": "can0",
                 "options": {"host": "127.0.0.1", "port": self.bus.port, "tcp_tune": True},
+                "shortest_cycle": "10 ms",  # in real time, on a computer that may be busy
             },
             "axes": [
                 {

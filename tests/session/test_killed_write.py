@@ -12,6 +12,8 @@ from tests.kills import random_moment, tried
 
 pytestmark = pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="no SIGKILL on Windows")
 AXES, MOMENTS = 2, 5
+MOVING = 0.1
+"""rad/s of a motor that moves, for sure."""
 STORE_TIME = 0.2
 
 
@@ -107,14 +109,17 @@ NEW = {"position_p": 15.0, "velocity_p": 3.5, "velocity_i": 25.0}
 def test_a_tool_that_is_killed_in_the_trial_leaves_drives_that_stop_and_can_be_restored(machine):
     machine.set_up(OLD, store=True)
     before = machine.working()
-    seen = {"written": 0, "syncs": 0}
+    seen = {"written": 0, "syncs": 0, "powered": 0}
 
     def kill_in_trial(message):
         if is_download(message) and object_of(message) == 0x2010:
             seen["written"] += 1
         if message.arbitration_id == 0x80 and seen["written"] and not tool.killed:
             seen["syncs"] += 1
-            if any(node.motion.powered for node in machine.nodes) and seen["syncs"] > 300:
+            axes = machine.machine.axes
+            speeds = axes.state[axes.plant.size + axes.plant.motors]
+            if seen["syncs"] > 50 and np.max(np.abs(speeds)) > MOVING:
+                seen["powered"] = sum(node.motion.powered for node in machine.nodes)
                 tool.kill()
 
     machine.bus.on_frame = kill_in_trial
@@ -123,6 +128,7 @@ def test_a_tool_that_is_killed_in_the_trial_leaves_drives_that_stop_and_can_be_r
     ended = tool.wait()
     assert ended.code == -9, ended.text
     machine.bus.on_frame = lambda _: None
+    assert seen["powered"] == AXES, "an axis moved, under power"
     assert machine.working()[11][0x2010, 1] == 15000, "the new ones were on trial"
     machine.ask(lambda: machine.machine.advance_to(machine.machine.time + 1_000_000_000))
     for node in machine.nodes:
