@@ -23,6 +23,9 @@ from drives.profile import CouplingProfile
 OUTPUT = struct.Struct("<Hih")
 INPUT = struct.Struct("<Hih")
 
+HELD_CYCLES = 20
+"""Cycles in a row with the same target and torque after which an axis counts as held: coupled axes push
+it then, its loop pushes back, and it moves against its own torque as it has to."""
 MISSING_ALLOWED = 1
 """Cycles in a row in which a PDO may be missing."""
 HEARTBEATS_MISSED = 3.5
@@ -124,6 +127,10 @@ class Channel:
     """Positions of the last cycles, without a gap."""
     turned: Reversed | None = None
     """Looks for a motor that turns against its torque; None for a floating axis."""
+    told: tuple[int, int] = (0, 0)
+    """Target and torque (offset) that were sent last, drive units."""
+    held: int = 0
+    """Cycles in a row in which these were the same."""
 
     @property
     def state(self) -> PowerState | None:
@@ -187,6 +194,11 @@ class Channel:
         else:
             disturbed = sum(other.shaken * torques for other, torques in self.others)
             self.unseen.take(self.position, torque, cycles, disturbed)
+            before, self.told = self.told, OUTPUT.unpack(self.output.data)[1:]
+            self.held = self.held + 1 if self.told == before else 0
+            if self.held > HELD_CYCLES:
+                self.turned.restart()
+                return
             friction = self.drive.learned.friction
             self.turned.take(self.position, torque, cycles, friction)
 

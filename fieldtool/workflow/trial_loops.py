@@ -42,6 +42,7 @@ def drive_loop(drive: CanopenDrive, servo: Servo) -> DriveLoop:
         unsure,
         0.0 if profile.interpolation == "linear" else timing.cycle,
         servo.torque_noise(abs(drive.scaling.position)),
+        servo.count_torque(abs(drive.scaling.position)),
         _why_not_told(drive),
     )
 

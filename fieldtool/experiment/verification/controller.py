@@ -50,7 +50,9 @@ class DriveLoop:
     unsure_targets: float = 0.0
     """s, by which its reference may besides: where it is not known how it goes from target to target."""
     noise: float = 0.0
-    """RMS of the torque that the steps of its encoder make N m or N."""
+    """RMS of the torque that the steps of its encoder make, N m or N."""
+    count: float = 0.0
+    """Largest torque that one step of its encoder makes, N m or N."""
     why_not: str = ""
     """Why nobody can say what its torque should be; empty where one can."""
 

@@ -51,9 +51,10 @@ EXPLAINS = 0.06
 """Share of the differences' squares that being late has to explain to be believed."""
 BLIND, BLIND_AGAIN = 0.015, 0.1
 """s from the beginning of a motion, and from a sample that did not come, in which nothing is said."""
-QUANTA, ENCODER, STILL = 3.0, 4.0, 2.5
-"""Steps of the torque, times the RMS of what encoders' steps make, and times what was seen while all
-axes stood still, by which torques may differ at any time."""
+QUANTA, ENCODER, COUNT, STILL = 3.0, 4.0, 1.5, 2.5
+"""Steps of the torque, times the RMS of what encoders' steps make or times what one of them makes (when
+it came within a cycle nobody knows), and times what was seen while all axes stood still, by which
+torques may differ at any time."""
 
 
 class IdentityWatch:
@@ -108,12 +109,13 @@ class IdentityWatch:
         if learned is not None:
             late = late + LEARNED * learned.late
         self._late = np.array([late + [loop.unsure_targets for loop in loops], late])
-        encoder = ENCODER * np.array([loop.noise for loop in loops])
-        self._floor = QUANTA * self._quanta + encoder
+        encoder = np.array([loop.noise for loop in loops])
+        counts = COUNT * np.array([loop.count for loop in loops])
+        self._floor = QUANTA * self._quanta + np.maximum(ENCODER * encoder, counts)
         self._scale = np.ones(len(loops))
         self._gains = GainEstimate(
             self._quanta,
-            encoder / ENCODER,
+            encoder,
             np.array([loop.loop.position_p * self._step for loop in loops]),
             self._late[1],
             self._step,
