@@ -112,8 +112,8 @@ def _gain(criticism: Criticism) -> Sheet:
         after, noise = held.error_after[name], held.noise_floor[name]
         table.add(
             name,
-            *("hidden" if e.told is None else f"{100 * e.told:.3g} %" for e in (before, after)),
-            "not known" if noise is None or before.told is None else f"{100 * noise:.2g} %",
+            *("hidden" if e.torque is None else f"{100 * e.torque:.3g} %" for e in (before, after)),
+            "not known" if noise is None or before.torque is None else f"{100 * noise:.2g} %",
             f"{100 * before.position:.2g} %",
             f"{100 * after.position:.2g} %",
         )

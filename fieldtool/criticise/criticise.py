@@ -26,7 +26,9 @@ from fieldtool.criticise.search.afterwards import FALSE_ZERO, Accepted
 from fieldtool.criticise.search.fit import Fitted
 from fieldtool.criticise.search.judge import Parts
 from fieldtool.criticise.search.machine import Machine
+from fieldtool.criticise.search.marks import Unmarked
 from fieldtool.criticise.search.prepare import Prepared, prepare
+from fieldtool.criticise.search.rules import LEFT
 from fieldtool.criticise.search.search import Advance, Found, search
 from fieldtool.criticise.simulate.inverse import needed_torque
 from fieldtool.criticise.simulate.structure import Structure
@@ -42,8 +44,8 @@ from fieldtool.records.model import Estimate, MachineModel
 from fieldtool.records.recording import Recording
 
 FloatArray = NDArray[np.float64]
-SMALL = 0.01
-"""Error of the torque beyond its noise that does not matter."""
+SMALL_UNSURE = 0.01
+"""Error of the torque that does not matter, where its noise is not known."""
 NEAR_NOISE = 1.5
 """Error over noise (RMS) up to which it is all noise."""
 ENOUGH, ENOUGH_KNOWN, ENOUGH_SURE = 0.9, 0.97, 0.98
@@ -132,6 +134,7 @@ def criticise(
                     for e in after
                     if verdict != "adequate" and _matters(e.error, e.noise)
                 ),
+                *(_unmarked(found, u) for u in found.unmarked if verdict != "adequate"),
                 *(zeros.values() if causes else ()),
             ),
             held_out=held,
@@ -277,8 +280,8 @@ def _axis_errors(found: Found, fitted: Fitted) -> tuple[AxisError, ...]:
 def _matters(error: float, noise: float | None) -> bool:
     """Whether an error is beyond noise, and large enough to be worth a word."""
     if noise is None:
-        return error > SMALL
-    return error > NEAR_NOISE * noise and error**2 - noise**2 > SMALL**2
+        return error > SMALL_UNSURE
+    return error > NEAR_NOISE * noise and error**2 - noise**2 > LEFT**2
 
 
 def _axis(names: Sequence[str], effect: Effect) -> str | tuple[str, str]:
@@ -319,10 +322,26 @@ def _evidence(torque: float, p: float, blocks: int, effect: Effect) -> str:
     )
 
 
+def _unmarked(found: Found, one: Unmarked) -> str:
+    """Say what would fit, by its numbers and its signature, and why it has no name."""
+    effect, mark = one.effect, one.mark
+    numbers = ", ".join(
+        f"{name} {n.value:.3g} {n.unit}" for name, n in numbers_of(one.fitted, effect).items()
+    )
+    others = f"{mark.relative} or {mark.or_else}" if mark.or_else else mark.relative
+    axis = " - ".join(np.atleast_1d(_axis(found.prepared.recording.names, effect)))
+    return (
+        f"{axis}: {effect.signature}; {effect.name} would fit ({numbers}), but so might {others}, and "
+        f"what tells them apart is not shown: {mark.words}"
+    )
+
+
 def _held_out(found: Found) -> HeldOut:
     prepared = found.prepared
     names = prepared.recording.names
     errors, relative = [], []
+    lines = [one for one in prepared.simulator.lines if one.span.role == "unseen"]
+    told = {k for k in range(len(names)) if any(np.any(one.weight[:, k] > 0.0) for one in lines)}
     for fitted in (found.before, found.after):
         parts = prepared.simulator.parts(fitted.hypothesis, "unseen")
         structure = Structure.of(fitted.hypothesis.machine.with_values(fitted.hypothesis.base))
@@ -330,7 +349,10 @@ def _held_out(found: Found) -> HeldOut:
         torques = [relative_error(parts, k) for k in range(len(names))]
         relative.append(torques)
         errors.append(
-            {n: SignalError(t, p) for n, t, p in zip(names, torques, positions, strict=True)}
+            {
+                n: SignalError(t if k in told else None, p)
+                for k, (n, t, p) in enumerate(zip(names, torques, positions, strict=True))
+            }
         )
     parts = prepared.simulator.parts(found.after.hypothesis, "unseen")
     noise = [relative_noise(parts, k) for k in range(len(names))]
@@ -369,7 +391,8 @@ def _false_zeros(found: Found) -> dict[str, str]:
 
 def _verdict(causes: Sequence[Cause], held: HeldOut, zeros: Mapping[str, str]) -> Verdict:
     names = list(held.error_before)
-    left = {n for n in names if _matters(held.error_after[n].torque, held.noise_floor[n])}
+    errors = {n: held.error_after[n].torque or 0.0 for n in names}
+    left = {n for n in names if _matters(errors[n], held.noise_floor[n])}
     if not causes:
         return "unexplained" if left else "adequate"
     # Beside a cause that has a name even little counts: it may be of another cause than of that one.
@@ -377,7 +400,7 @@ def _verdict(causes: Sequence[Cause], held: HeldOut, zeros: Mapping[str, str]) -
     left |= {
         n
         for n, noise in held.noise_floor.items()
-        if noise is not None and held.error_after[n].torque > NEAR_NOISE * noise and of_axis[n]
+        if noise is not None and errors[n] > NEAR_NOISE * noise and of_axis[n]
     }
     for n in left:
         sure = all(LIBRARY[c.effect].exact for c in of_axis[n])

@@ -66,14 +66,9 @@ class Cause:
 class SignalError:
     """RMS of measured minus simulated over RMS of measured, of one axis."""
 
-    torque: float
-    """0 where the encoder hides at all frequencies what torque the motion needs."""
+    torque: float | None
+    """None where the encoder hides at all frequencies what torque the motion needs."""
     position: float
-
-    @property
-    def told(self) -> float | None:
-        """The torque's, None where nothing can be said of it."""
-        return self.torque or None
 
 
 @dataclass(frozen=True)
@@ -173,7 +168,7 @@ class Criticism:
         }
 
 
-def _errors(errors: Mapping[str, SignalError]) -> dict[str, dict[str, float]]:
+def _errors(errors: Mapping[str, SignalError]) -> dict[str, dict[str, float | None]]:
     return {name: {"torque": e.torque, "position": e.position} for name, e in errors.items()}
 
 

@@ -49,7 +49,7 @@ class _Cause(StrictModel):
 
 
 class _SignalError(StrictModel):
-    torque: Value
+    torque: Value | None
     position: Value
 
 

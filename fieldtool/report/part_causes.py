@@ -67,7 +67,7 @@ def gain(material: Material) -> Section | None:
     meaning = "An error is the RMS of measured minus simulated over the RMS of measured."
     if not criticism.causes:
         plain = tuple(
-            (name, percent(e.told), percent(held.noise_floor[name]), percent(e.position))
+            (name, percent(e.torque), percent(held.noise_floor[name]), percent(e.position))
             for name, e in held.error_before.items()
         )
         table = Table(("axis", "torque: error", "noise floor", "position: error"), plain)
@@ -75,8 +75,8 @@ def gain(material: Material) -> Section | None:
     rows = tuple(
         (
             name,
-            percent(first.told),
-            percent(held.error_after[name].told),
+            percent(first.torque),
+            percent(held.error_after[name].torque),
             percent(held.noise_floor[name]),
             percent(held.explained.get(name)),
             percent(first.position),
@@ -85,9 +85,9 @@ def gain(material: Material) -> Section | None:
         for name, first in held.error_before.items()
     )
     groups: dict[str, dict[str, float | None]] = {
-        "before": {name: 100 * e.torque for name, e in held.error_before.items()},
-        "after": {name: 100 * e.torque for name, e in held.error_after.items()},
-        "noise floor": {n: None if v is None else 100 * v for n, v in held.noise_floor.items()},
+        "before": {n: _hundredfold(e.torque) for n, e in held.error_before.items()},
+        "after": {n: _hundredfold(e.torque) for n, e in held.error_after.items()},
+        "noise floor": {n: _hundredfold(v) for n, v in held.noise_floor.items()},
     }
     table = Table(
         (
@@ -137,3 +137,7 @@ def rejected(material: Material) -> Section | None:
         (Table(("cause", "axis", "where", "why not"), rows),),
         folded=True,
     )
+
+
+def _hundredfold(share: float | None) -> float | None:
+    return None if share is None else 100 * share

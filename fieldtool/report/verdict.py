@@ -47,7 +47,7 @@ def verdict(material: Material) -> tuple[str, str]:
 
 def _of(criticism: Criticism) -> str:
     held = criticism.held_out
-    worst = max(held.error_before, key=lambda n: held.error_before[n].torque, default="")
+    worst = max(held.error_before, key=lambda n: held.error_before[n].torque or 0.0, default="")
     if not worst:
         return f"The verdict is: {MEANING[criticism.verdict]}."
     before, after = held.error_before[worst].torque, held.error_after[worst].torque

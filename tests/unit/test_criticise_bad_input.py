@@ -147,8 +147,11 @@ def test_where_steps_hide_every_torque_nothing_is_said_of_it(good, criticise, mo
     monkeypatch.setattr(lines, "_weighed", without([0]))
     code, out, _ = criticise(good, *criticise.model)
     assert code == 0
-    where = json.loads(out)["criticism"]["where"]
-    assert where[0].startswith("a: nothing can be said of its torque")
+    criticism = json.loads(out)["criticism"]
+    assert criticism["where"][0].startswith("a: nothing can be said of its torque")
+    before = criticism["held_out"]["error_before"]
+    assert before["a"]["torque"] is None
+    assert before["b"]["torque"] > 0.0
     code, out, _ = criticise(good, *criticise.model[:2])
     assert "hidden" in out
     monkeypatch.setattr(lines, "_weighed", without([0, 1]))

@@ -6,6 +6,7 @@ from fieldtool.criticise.effects.coupling import (
     CouplingSpring,
     coupling_candidates,
 )
+from fieldtool.criticise.effects.disturbance import PeriodicDisturbance, disturbance_candidates
 from fieldtool.criticise.effects.friction import (
     AsymmetricFriction,
     CoulombFriction,
@@ -31,11 +32,9 @@ from fieldtool.criticise.effects.springs import (
 )
 from fieldtool.criticise.effects.torque import (
     MeasurementDelay,
-    PeriodicDisturbance,
     TorqueLag,
     TorqueSaturation,
     TorqueScale,
-    disturbance_candidates,
     torque_candidates,
 )
 

@@ -41,6 +41,32 @@ class Parameter:
 
 
 @dataclass(frozen=True)
+class Mark:
+    """What sets an effect apart from a relative: a number that is 0 for itself and 1 for the relative.
+
+    The number is fitted beside the effect, to all data; only if it is known to be nearer to 0 the
+    effect is named for sure.
+    """
+
+    relative: str
+    """Name of the effect that leaves the same but for this."""
+    words: str
+    """What the data have to show, to stand after "not shown:"."""
+    number: str
+    """Of :attr:`beside`; without that, of the axis' variables of the machine."""
+    whole: float
+    """Value of the number where the effect is its relative."""
+    beside: "Effect | None" = None
+    """A form without a name, whose number bends the effect into its relative."""
+    special: bool = False
+    """Whether the effect is the relative's special case: it keeps its name until the number is not 0."""
+    either_sign: bool = False
+    """Whether a number below 0 speaks for the relative as well."""
+    or_else: str = ""
+    """What else than the relative the number may be of; then it decides nothing between both."""
+
+
+@dataclass(frozen=True)
 class Effect:
     """One effect at one place of the machine."""
 
@@ -58,6 +84,8 @@ class Effect:
     """Whether couplings pass on what is unknown of it to all axes."""
     exact: ClassVar[bool] = False
     """Whether its form is no approximation of what machines have."""
+    relatives: ClassVar[tuple[str, ...]] = ()
+    """Effects on the same axis that are fitted wherever this one is: they leave nearly the same."""
     fits: ClassVar[float] = 0.95
     """Share of what is wrong of its axis that its form explains at least, where it is the only cause."""
 
@@ -104,6 +132,10 @@ class Effect:
     def implausible(self, values: Values, context: "Context") -> str:
         """Say why these values are no physical answer; empty where they are."""
         return ""
+
+    def marks(self, values: Values, context: "Context") -> tuple[Mark, ...]:
+        """Return what sets the effect, at these values, apart from its relatives."""
+        return ()
 
     def plain(self, values: Values) -> dict[str, tuple[float, str, tuple[str, ...]]]:
         """Return the numbers that are reported: name -> (value, unit, fitted ones it depends on)."""

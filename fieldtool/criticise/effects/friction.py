@@ -9,7 +9,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from fieldtool.criticise.effects.base import Context, Effect, FloatArray, Parameter, Values
+from fieldtool.criticise.effects.base import (
+    Context,
+    Effect,
+    FloatArray,
+    Mark,
+    Parameter,
+    Values,
+)
 from fieldtool.criticise.simulate.kernels import slider
 from fieldtool.criticise.simulate.motion import Motion
 from fieldtool.criticise.simulate.structure import Element, Law, Structure
@@ -18,6 +25,8 @@ TURNS = ((1e-5, 1e-3), (1e-5, 0.03), (1e-3, 1e-3), (1e-2, 1e-3))
 """Start values: presliding distance over the travel, rounding velocity over the fastest."""
 OF_ITS_OWN = 0.1
 """Of friction, that has to fall with the speed or differ between the directions to be called so."""
+FALLS_AT = 0.15
+"""Share of the fastest velocity within which dry friction that is no Coulomb friction falls."""
 SLOWEST = (0.05, 0.15, 0.4)
 """Shares of the fastest velocity, as start values of the Stribeck velocity."""
 
@@ -32,6 +41,7 @@ class ViscousFriction(Effect):
     signature = "torque in phase with the velocity, linear, at all speeds"
     contrary = "odd harmonics of a sine; a step where the velocity changes its sign"
     shows = ("speed",)
+    relatives = ("structural_damping",)
 
     def structure(self, structure: Structure, values: Values) -> Structure:
         """Add to the damping of the mass."""
@@ -39,6 +49,17 @@ class ViscousFriction(Effect):
         ends = structure.motors if self.location == "motor" else structure.ends
         damping[ends[self.axis], ends[self.axis]] += values["coefficient"]
         return replace(structure, damping=damping)
+
+    def marks(self, values: Values, context: Context) -> tuple[Mark, ...]:
+        """A loss against ground: at the motor there must be none below zero to make up for it.
+
+        Friction at the load less the same at the motor is a loss in the springs.
+        """
+        known = abs(context.model.axes[self.axis].viscous_friction.value)
+        if self.location == "motor" or not known:
+            return ()
+        words = "a friction of the motor that is not below zero beside it"
+        return (Mark("structural_damping", words, "viscous_friction", -known, special=True),)
 
 
 class CoulombFriction(Effect):
@@ -65,6 +86,62 @@ class CoulombFriction(Effect):
             return structure
         dry = (values["torque"], values["rounding"], 0.0, 0.0)
         return structure.with_elements(Element(Law.DRY, int(structure.ends[self.axis]), -1, dry))
+
+    def marks(self, values: Values, context: Context) -> tuple[Mark, ...]:
+        """The same torque in both directions, and at all speeds."""
+        if self.location != "motor":
+            return ()
+        whole = 2.0 * OF_ITS_OWN * values["torque"]
+        return (
+            Mark(
+                "asymmetric_friction",
+                "the same torque in both directions",
+                "offset",
+                0.5 * whole,
+                special=True,
+                either_sign=True,
+                or_else="a false zero of the torque's measurement",
+            ),
+            Mark(
+                "stribeck_friction",
+                "the same torque at all speeds",
+                "extra",
+                whole,
+                FallingFriction.beside(self, values, context),
+                special=True,
+            ),
+        )
+
+
+class FallingFriction(Effect):
+    """What dry friction has more of at low speed than at high speed, whatever its law.
+
+    It has no name of its own.
+    """
+
+    name = "falling_friction"
+    equation = "tau = extra exp(-abs(v) / velocity) sign(v)"
+    source = "Tustin 1947; Armstrong-Helouvry et al., Automatica 30, 1994"
+    signature = "follows the sign of the velocity at low speed only"
+    contrary = "a torque at high speed"
+
+    def torque(self, motion: Motion, values: Values) -> FloatArray | None:
+        """At the motor."""
+        speed = np.abs(motion.smooth_velocity[:, self.axis]) / values["velocity"]
+        limit = np.exp(-speed) * _rounded(motion, self.axis, values)
+        position = np.ascontiguousarray(motion.smooth_position[:, self.axis])
+        return np.asarray(values["extra"] * slider(position, limit, limit, values["presliding"]))
+
+    @classmethod
+    def beside(cls, dry: Effect, values: Values, context: Context) -> "FallingFriction":
+        """Return none at all of it, to be fitted beside dry friction."""
+        size, torque = context.torque_size(dry.axis), context.torque_unit(dry.axis)
+        velocity = FALLS_AT * context.fastest(dry.axis)
+        length, speed = context.length_unit(dry.axis), _speed_unit(context, dry.axis)
+        fixed = [("velocity", speed, velocity), ("presliding", length, values["presliding"]),
+                 ("rounding", speed, values["rounding"])]  # fmt: skip
+        extra = Parameter("extra", torque, 0.0, -10 * size, 10 * size, 0.1 * size, linear=True)
+        return cls(dry.axis, (extra, *(Parameter(n, u, v, v, v, 0.0) for n, u, v in fixed)))
 
 
 class StribeckFriction(Effect):

@@ -127,6 +127,7 @@ class StructuralDamping(SpringEffect):
     source = "Kimball and Lovell 1927; five Maxwell branches a decade and a half wide stand for it"
     signature = "resonances of all frequencies damped by the same loss factor; linear"
     contrary = "damping in proportion to the frequency; harmonics"
+    relatives = ("viscous_friction",)
 
     def structure(self, structure: Structure, values: Values) -> Structure:
         """Add branches whose losses together are nearly constant over the band."""

@@ -3,23 +3,22 @@
 from dataclasses import replace
 
 import numpy as np
-from scipy.ndimage import maximum_filter, median_filter
 from scipy.signal import lfilter
 
-from fieldtool.criticise.effects.base import Context, Effect, FloatArray, Parameter, Values
-from fieldtool.criticise.simulate.motion import FIRST, Motion, differentiate
+from fieldtool.criticise.effects.base import (
+    Context,
+    Effect,
+    FloatArray,
+    Mark,
+    Parameter,
+    Values,
+)
+from fieldtool.criticise.simulate.motion import FIRST, SECOND, Motion, differentiate
 
 LONGEST = 0.02
 """s: no delay or lag of a drive is longer."""
 SHORTEST = 0.02
 """Of a cycle: a shorter delay or lag is none."""
-FEWEST_CYCLES = 8.0
-"""Of a disturbance within the shortest experiment."""
-STANDS_OUT = 12.0
-"""Power of a line over the median of those around it, from which it is tried as a disturbance."""
-AROUND = 12
-OFF_HARMONICS = 0.6
-"""Lines from the harmonics of the excitation within which nothing is called a disturbance."""
 BENDS = 0.2
 """Of the largest torque: what bends over a wider range than this is no limit."""
 CLIPPED = (0.95, 0.85, 0.7, 0.5)
@@ -41,6 +40,31 @@ class TorqueScale(Effect):
         return torque / values["scale"]
 
 
+class TimeSpread(Effect):
+    """What the second moment of an impulse response does: a gain that changes with frequency squared.
+
+    It has no name of its own.  Whatever is linear and late has a mean time, which is a phase in
+    proportion to the frequency, and a spread about it: none for a delay, as large as the mean for a lag
+    of first order.
+    """
+
+    name = "time_spread"
+    equation = "reported = true + square true''"
+    source = "moments of an impulse response; Astrom and Hagglund, Advanced PID Control, 2006"
+    signature = "a gain that changes with the square of the frequency; linear"
+    contrary = "a phase"
+
+    def reported(self, torque: FloatArray, motion: Motion, values: Values) -> FloatArray:
+        """Add to the torque its curvature."""
+        return torque + values["square"] * differentiate(torque, SECOND, motion.step**2)
+
+    @classmethod
+    def of(cls, axis: int) -> "TimeSpread":
+        """Return none at all of it, to be fitted."""
+        most = LONGEST**2
+        return cls(axis, (Parameter("square", "s2", 0.0, -most, most, 1e-8, linear=True),))
+
+
 class TorqueLag(Effect):
     """A torque that follows what the drive reports only after a first-order lag."""
 
@@ -55,6 +79,18 @@ class TorqueLag(Effect):
     def implausible(self, values: Values, context: Context) -> str:
         """Refuse what is small beside a cycle, as of a delay."""
         return _unnoticed(values["time"], context)
+
+    def marks(self, values: Values, context: Context) -> tuple[Mark, ...]:
+        """A gain that falls."""
+        return (
+            Mark(
+                "measurement_delay",
+                "a gain that falls with the square of the frequency as that of a lag must",
+                "square",
+                0.5 * values["time"] ** 2,
+                TimeSpread.of(self.axis),
+            ),
+        )
 
     def reported(self, torque: FloatArray, motion: Motion, values: Values) -> FloatArray:
         """Report what has to be asked for; a negative time: the report itself lags."""
@@ -84,6 +120,18 @@ class MeasurementDelay(Effect):
     def implausible(self, values: Values, context: Context) -> str:
         """Refuse what is small beside a cycle: nobody knows the moments of samples that well."""
         return _unnoticed(values["delay"], context)
+
+    def marks(self, values: Values, context: Context) -> tuple[Mark, ...]:
+        """A gain that stays."""
+        return (
+            Mark(
+                "torque_lag",
+                "a gain of one at the frequencies at which that of a lag would have fallen",
+                "square",
+                -0.5 * values["delay"] ** 2,
+                TimeSpread.of(self.axis),
+            ),
+        )
 
     def motion(self, motion: Motion, values: Values) -> Motion:
         """Shift the motion of the axis to when it was, by Lagrange interpolation."""
@@ -123,24 +171,6 @@ class TorqueSaturation(Effect):
         # At rest nothing is given: what the rounded corner lacks there is the same everywhere.
         none = values["limit"] - width * np.logaddexp(0.0, values["limit"] / width)
         return np.asarray(torque + np.sign(asked) * (size - given + none))
-
-
-class PeriodicDisturbance(Effect):
-    """A torque of one frequency in time, whatever the axis does."""
-
-    name = "periodic_disturbance"
-    equation = (
-        "tau = amplitude sin(2 pi frequency t + phase), a phase of its own in each experiment"
-    )
-    source = "a neighbour's drive, a pump, the mains; Bodson, Adaptive Algorithms, 2005"
-    signature = "one line of the spectrum at the same frequency in all experiments"
-    contrary = "a frequency that goes with the speed or the period of the excitation"
-    spreads = True
-
-    def unknown(self, motion: Motion, values: Values) -> tuple[FloatArray, ...]:
-        """Return sine and cosine, of unknown size."""
-        phase = 2 * np.pi * values["frequency"] * motion.clock
-        return np.sin(phase), np.cos(phase)
 
 
 def _unnoticed(time: float, context: Context) -> str:
@@ -187,72 +217,6 @@ def torque_candidates(context: Context) -> list[Effect]:
             for share in CLIPPED
         ]
     return out
-
-
-def disturbance_candidates(context: Context) -> list[Effect]:
-    """Return single frequencies at which the error stands out of those around it, in all experiments."""
-    out: list[Effect] = []
-    longest = max(context.motions, key=lambda m: m.rows)
-    shortest = min(m.rows * m.step for m in context.motions)
-    grid = np.fft.rfftfreq(longest.rows, longest.step)
-    width = 1.0 / (longest.rows * longest.step)
-    inside = (grid > FEWEST_CYCLES / shortest) & (grid < context.top)
-    for fundamental, spacing in context.fundamentals:
-        # On a harmonic of the excitation nobody can tell a disturbance from what was excited.
-        off = np.abs(grid - fundamental * np.rint(grid / fundamental))
-        inside &= off > OFF_HARMONICS * spacing
-    if not inside.any():
-        return out
-    for axis in range(len(context.axes)):
-        level = np.full(int(inside.sum()), np.inf)
-        for motion, error in zip(context.motions, context.errors, strict=True):
-            power = np.abs(np.fft.rfft(error[:, axis] * np.hanning(motion.rows))) ** 2
-            floor = median_filter(power, size=2 * AROUND + 1, mode="nearest")
-            ratio = power / np.maximum(floor, 1e-300)
-            frequency = np.fft.rfftfreq(motion.rows, motion.step)
-            # The peak may lie between two lines of a shorter experiment.
-            ratio = maximum_filter(ratio, size=3, mode="nearest")
-            level = np.minimum(level, np.interp(grid[inside], frequency, ratio))
-        for k in np.argsort(level)[::-1][:2]:
-            if level[k] > STANDS_OUT:
-                f = _between_lines(longest.torque.shape[0], context, longest, axis, grid[inside][k])
-                low, high = _off_harmonics(context, f, 1.5 * width)
-                if not low < f < high or _passed_on(context, longest, axis, f):
-                    continue
-                number = Parameter("frequency", "Hz", f, low, high, 0.1 * width)
-                out.append(PeriodicDisturbance(axis, (number,)))
-    return out
-
-
-def _passed_on(context: Context, motion: Motion, axis: int, frequency: float) -> bool:
-    """Whether a line is stronger in another axis, from which couplings pass it on."""
-    error = context.errors[context.motions.index(motion)]
-    turning = np.exp(-2j * np.pi * frequency * motion.clock) * np.hanning(motion.rows)
-    mass = np.sqrt([context.inertia(k) for k in range(error.shape[1])])
-    size = np.abs(turning @ error) / mass
-    return bool(size[axis] < size.max())
-
-
-def _off_harmonics(context: Context, frequency: float, reach: float) -> tuple[float, float]:
-    """Bounds about a frequency that no harmonic of the excitation is near to."""
-    low, high = frequency - reach, frequency + reach
-    for fundamental, spacing in context.fundamentals:
-        below = fundamental * np.floor(frequency / fundamental)
-        low = max(low, below + OFF_HARMONICS * spacing)
-        high = min(high, below + fundamental - OFF_HARMONICS * spacing)
-    return low, high
-
-
-def _between_lines(rows: int, context: Context, longest: Motion, axis: int, peak: float) -> float:
-    """Return where between two lines a peak lies, from a parabola through the logarithms."""
-    error = context.errors[context.motions.index(longest)][:, axis]
-    power = np.log(np.abs(np.fft.rfft(error * np.hanning(rows))) ** 2 + 1e-300)
-    spacing = 1.0 / (rows * longest.step)
-    k = int(np.clip(round(peak / spacing), 2, power.size - 3))
-    k += int(np.argmax(power[k - 1 : k + 2])) - 1
-    bend = power[k - 1] - 2 * power[k] + power[k + 1]
-    shift = 0.5 * (power[k - 1] - power[k + 1]) / bend if bend < 0 else 0.0
-    return float((k + np.clip(shift, -0.5, 0.5)) * spacing)
 
 
 def _shifted(values: FloatArray, axis: int, shift: float) -> FloatArray:

@@ -288,8 +288,8 @@ def convincing(
     """Give no name on an axis where its causes leave what they should explain.
 
     Whatever is left there would bend their numbers, and may be what they stand in for.  All causes
-    together explain most of what is wrong.  A single one explains what its form should, or what it
-    leaves does at least not look as it must look itself.
+    together explain most of what is wrong; and what their forms should, or what they leave does at
+    least not look as one of them must look itself.
     """
     kept = list(accepted)
     first = prepared.simulator.parts(before.hypothesis, "unseen")
@@ -303,11 +303,11 @@ def convincing(
         left, level = relative_errors(last)[axis], relative_noise(last, axis) or noise
         share = (there[axis] - left) / (there[axis] - noise**2)
         others = [a for a in kept if axis in _axes_of(a.tried.effect) and a not in alone]
-        single = alone[0].tried.effect if len(alone) == 1 and not others else None
-        poor = single is not None and share < single.fits and left > BESIDE_NOISE * level**2
-        poor = poor and left - level**2 > LEFT**2
-        poor = poor and single is not None and _looks(prepared, current, single)
-        poor = poor or (single is not None and _asks_for_zero(prepared, current, single))
+        effects = [a.tried.effect for a in (*alone, *others)]
+        poor = share < float(np.prod([e.fits for e in effects]))
+        poor = poor and left > BESIDE_NOISE * level**2 and left - level**2 > LEFT**2
+        poor = poor and any(_looks(prepared, current, e) for e in effects)
+        poor = poor or (len(effects) == 1 and _asks_for_zero(prepared, current, effects[0]))
         if share >= MOST_OF_IT and not poor:
             continue
         for a in alone:

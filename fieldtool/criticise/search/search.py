@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from fieldtool.criticise.effects import candidates
 from fieldtool.criticise.effects.base import Context, Effect
-from fieldtool.criticise.effects.torque import disturbance_candidates
+from fieldtool.criticise.effects.disturbance import disturbance_candidates
 from fieldtool.criticise.search.afterwards import (
     Accepted,
     Reasons,
@@ -21,9 +21,10 @@ from fieldtool.criticise.search.afterwards import (
     unsigned,
 )
 from fieldtool.criticise.search.fit import EXACTLY, Fitted, fit, strain
-from fieldtool.criticise.search.hypothesis import Hypothesis, Simulator
+from fieldtool.criticise.search.hypothesis import Hypothesis
 from fieldtool.criticise.search.instants import timed
 from fieldtool.criticise.search.judge import Parts, beyond_noise, difference, judged, moved
+from fieldtool.criticise.search.marks import Unmarked, marked, on_all_rows
 from fieldtool.criticise.search.prepare import Prepared, reweighted
 from fieldtool.criticise.search.rules import (
     ALIKE_T,
@@ -79,6 +80,7 @@ class Found:
     accepted: tuple[Accepted, ...]
     """In the order of their gain."""
     rejected: tuple[tuple[Effect, str], ...]
+    unmarked: tuple[Unmarked, ...] = ()
 
 
 def search(
@@ -122,6 +124,9 @@ def search(
     advance("check the causes against each other", 0.9)
     current, accepted = pruned(prepared, current, accepted, rejected)
     current, accepted = tied(prepared, current, accepted, without)
+    current, accepted, unmarked = marked(prepared, current, accepted, rejected, without)
+    if unmarked:
+        current, accepted = pruned(prepared, current, accepted, rejected)
     before = fit(prepared.simulator, before.hypothesis)
     current, accepted = unharmful(prepared, before, current, accepted, rejected)
     current, accepted = convincing(prepared, before, current, accepted, rejected)
@@ -137,6 +142,7 @@ def search(
         final,
         tuple(sorted(accepted, key=lambda a: -a.tried.torque)),
         tuple(r for key, r in rejected.items() if key not in names),
+        tuple(unmarked),
     )
 
 
@@ -177,11 +183,7 @@ def settled(prepared: Prepared, start: Hypothesis) -> tuple[Prepared, Fitted]:
 
 
 def _on_all_rows(prepared: Prepared, current: Fitted) -> Fitted:
-    lines = tuple(
-        replace(one, span=replace(one.span, role="fit")) for one in prepared.simulator.lines
-    )
-    simulator = Simulator(prepared.motions, lines)
-    return fit(simulator, current.hypothesis, enough=EXACTLY)
+    return fit(on_all_rows(prepared), current.hypothesis, enough=EXACTLY)
 
 
 def _round(
@@ -289,13 +291,13 @@ def _why_not(
 
 
 def _chosen(ranked: Sequence[Screened], at: Tangent, named: set[int]) -> list[Screened]:
-    """Take the best few, with the delay always among them, and the simpler ones that they contain."""
+    """Take the best few, the delay always among them, and what they contain or are relatives of."""
     cost = float(at.side @ at.side)
     promising = [
         s for s in ranked if s.gain > (TRACE_MORE if s.effect.axis in named else TRACE) * cost
     ]
     chosen = promising[:FULL]
-    names = {(n, s.effect.axis) for s in chosen for n in s.effect.replaces}
+    names = {(n, s.effect.axis) for s in chosen for n in (*s.effect.replaces, *s.effect.relatives)}
     axes = {s.effect.axis for s in chosen}
     return chosen + [
         s

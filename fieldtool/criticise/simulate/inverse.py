@@ -206,6 +206,22 @@ def dynamic_stiffness(structure: Structure, omega: FloatArray) -> NDArray[np.com
     return np.asarray(out)
 
 
+def passed_on(structure: Structure, omega: float) -> NDArray[np.complex128]:
+    """Return what motor [row] needs besides per torque on the last mass of axis [column], (M, M).
+
+    The motors' motion is given; where the last mass is the motor, it needs that torque less.
+    """
+    whole = structure.stiffness + 1j * omega * structure.damping - omega**2 * structure.mass
+    hidden, motors = structure.hidden, structure.motors
+    out = -np.eye(motors.size, dtype=complex)
+    inner = whole[np.ix_(hidden, hidden)] + 1e-6j * np.abs(structure.stiffness).max(initial=0.0)
+    for axis, end in enumerate(structure.ends):
+        if end in hidden:
+            side = (hidden == end).astype(complex)
+            out[:, axis] = whole[np.ix_(motors, hidden)] @ np.linalg.solve(inner, side)
+    return out
+
+
 def _start(structure: Structure, motion: Motion) -> FloatArray:
     """Each hidden mass where its chain's motor is, at the same velocity."""
     hidden = structure.hidden
