@@ -47,11 +47,12 @@ ROUGH = 0.05
 """Share of what speeds tell of a change of speed that counts as scatter too."""
 GUESSED_SCATTER = 0.7
 """The same of the first blocks: a change of speed is made of four roundings."""
-STICKS, SLIDES = 0.7, 3
+STICKS, SLIDES, SLOWEST = 0.7, 3, 3
 """Position units from which what friction does in a step counts; speeds in a row of one sign of an axis
-that slides."""
-CLEAR = 1.5
-"""Times the scatter that a torque has to change the speed by to be any proof against a motor."""
+that slides, and the slowest: below, it creeps."""
+CLEAR = 2.0
+"""Times the scatter that a torque has to change the speed by, and that the speed has to change against
+it, to be any proof against a motor: an axis that is held proves nothing."""
 UNCLEAR = 0.2
 """Logarithm that a cycle without such a torque takes away: what is suspected needs more proof soon."""
 MOST = 7.0
@@ -211,7 +212,8 @@ class Reversed:
         ratio = (of_sound - of_reversed) / (2 * scatter**2 * self._step)
         if ratio > 0:
             ratio /= 1 + float(told_from @ answer.unsure @ told_from)
-            if abs(torque) < CLEAR * scatter:
+            clear = CLEAR * scatter
+            if abs(torque) < clear or abs(step) < clear or step * torque > 0:
                 ratio = -UNCLEAR
         self.total += max(-MOST, min(MOST, ratio))
         if self.total <= 0:
@@ -234,4 +236,4 @@ class Reversed:
 
 
 def _slides(speeds: list[int]) -> bool:
-    return all(s > 0 for s in speeds) or all(s < 0 for s in speeds)
+    return all(s >= SLOWEST for s in speeds) or all(s <= -SLOWEST for s in speeds)
