@@ -20,8 +20,8 @@ from fieldtool.criticise.search.hypothesis import Hypothesis, Simulator
 from fieldtool.criticise.search.prepare import Prepared, prepare
 from fieldtool.criticise.search.screen import screened, tangent
 from fieldtool.criticise.search.search import settled
-from fieldtool.criticise.simulate.motion import white_noise
 from fieldtool.errors import NotEnoughDataError
+from fieldtool.frf.velocity_band import white_noise
 from fieldtool.records.model import MachineModel
 from fieldtool.records.recording import Experiment, Recording
 

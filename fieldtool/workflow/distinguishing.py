@@ -13,12 +13,12 @@ from fieldtool.criticise.criticise import Criticised, criticise, starting_model
 from fieldtool.criticise.criticism import Cause, Criticism, Rejected, Rival
 from fieldtool.criticise.criticism_file import read_criticism
 from fieldtool.criticise.separate import DECISIVE, Separation, separation
-from fieldtool.criticise.simulate.motion import white_noise
 from fieldtool.errors import FileFormatError, NotEnoughDataError, PlanRefusedError
 from fieldtool.experiment.forecast import Setting
 from fieldtool.experiment.multisine.design import SHARE_OF_LIMITS
 from fieldtool.experiment.multisine.forecast import forecast_multisine, scaled_to_limits
 from fieldtool.experiment.multisine.plan import MultisinePlan
+from fieldtool.frf.velocity_band import white_noise
 from fieldtool.identify.likelihood.expected import Noise, expected_accuracy
 from fieldtool.records.model import MachineModel
 from fieldtool.records.model_file import read_model, write_model

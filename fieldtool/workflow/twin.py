@@ -12,8 +12,8 @@ from drives.errors import DrivesError, ProfileError
 from drives.parameters import load_backup
 from drives.profile import AxisProfile, MachineProfile, load_drive, load_machine
 from drives.sim.faces import face_names
-from fieldtool.criticise.simulate.motion import white_noise
 from fieldtool.errors import FileFormatError, PlanRefusedError
+from fieldtool.frf.velocity_band import white_noise
 from fieldtool.records.model import AxisModel, MachineModel
 from fieldtool.records.model_file import read_model
 from fieldtool.records.recording import Recording, load

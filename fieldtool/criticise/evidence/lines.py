@@ -20,8 +20,9 @@ from scipy.signal.windows import tukey
 from fieldtool.criticise.evidence.spans import Span
 from fieldtool.criticise.simulate.inverse import dynamic_stiffness
 from fieldtool.criticise.simulate.kernels import both_ways
-from fieldtool.criticise.simulate.motion import Motion, white_noise
+from fieldtool.criticise.simulate.motion import Motion
 from fieldtool.criticise.simulate.structure import Structure
+from fieldtool.frf.velocity_band import white_noise
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]

@@ -8,13 +8,13 @@ and modelled torque filtered alike.  Laws that bend at standstill (friction) tak
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from math import comb
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import butter, sosfiltfilt
 
 from fieldtool.frf.held_targets import folds
+from fieldtool.frf.velocity_band import STOPPED, UNSURE, velocity_noise, white_noise
 from fieldtool.records.recording import Experiment, Recording
 
 FloatArray = NDArray[np.float64]
@@ -26,10 +26,6 @@ SECOND = np.array(
 """The same for the second derivative times the step squared."""
 REACH = 4
 """Rows to either side that a difference needs."""
-UNSURE = 3.0
-"""Standard errors of the velocity below which an axis may be standing."""
-STOPPED = 2e-3
-"""Share of the fastest velocity below which an axis may be standing."""
 SMOOTH = 2.5
 """Corner of the smooth motion over the highest frequency that is compared."""
 FEWEST_ROWS = 200
@@ -83,12 +79,6 @@ def differentiate(values: FloatArray, weights: FloatArray, scale: float) -> Floa
         inner += weight * values[shift : shift + inner.shape[0]]
     ends = [(REACH, REACH)] + [(0, 0)] * (values.ndim - 1)
     return np.asarray(np.pad(inner / scale, ends, mode="edge"), dtype=np.float64)
-
-
-def white_noise(position: FloatArray) -> FloatArray:
-    """Standard error of each column's white noise, (M,): eighth differences leave no motion."""
-    left = np.median(np.abs(np.diff(position, 8, axis=0)), axis=0)
-    return np.asarray(left / 0.6745 / np.sqrt(comb(16, 8)), dtype=np.float64)
 
 
 def motions_of(
@@ -150,7 +140,7 @@ def _motion(
 
 def _counted(velocity: FloatArray, noise: FloatArray, corner: float, step: float) -> FloatArray:
     """Find the rows in which each axis moves for sure, (n, M)."""
-    spread = 2 * np.pi * corner * noise * np.sqrt(2 * corner * step / 3)
+    spread = velocity_noise(noise, np.full_like(noise, corner), step)
     fastest = np.quantile(np.abs(velocity), 0.99, axis=0)
     slow = np.abs(velocity) < np.maximum(UNSURE * spread, STOPPED * fastest)
     slow[1:] |= slow[:-1].copy()

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fieldtool.frf.phasors import Phasors
+from fieldtool.frf.velocity_band import velocity_band
 from fieldtool.identify.likelihood.refine import machine_response
 from fieldtool.records.model import Estimate, MachineModel
 from fieldtool.records.recording import Experiment
@@ -25,7 +26,7 @@ from fieldtool.records.recording import Experiment
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 VELOCITY_BAND = 3.0
-"""Velocity is taken from the position's lines up to so many times the highest excited one."""
+"""Velocity is of the position's lines up to so many times the highest excited one at least."""
 SEEN = 5.0
 """Standard errors from which dry friction is taken off before a fit."""
 
@@ -161,7 +162,7 @@ def _sign_lines(experiment: Experiment, step: float, band: tuple[float, float]) 
     count = position.shape[0]
     spectrum = np.fft.rfft(position, axis=0)
     frequencies = np.arange(spectrum.shape[0]) / period
-    spectrum[frequencies > VELOCITY_BAND * band[1]] = 0.0
+    spectrum[frequencies[:, None] > _band(experiment, step, band[1])] = 0.0
     velocity = np.fft.irfft(2j * np.pi * frequencies[:, None] * spectrum, count, axis=0)
     velocity += _drift(experiment, step)
     lines: ComplexArray = np.fft.rfft(np.sign(velocity), axis=0)[1 : count // 2] * (2 / count)
@@ -171,8 +172,8 @@ def _sign_lines(experiment: Experiment, step: float, band: tuple[float, float]) 
 def signs_of_velocity(experiment: Experiment, step: float, highest: float) -> FloatArray:
     """Return the sign of each motor's velocity in every row, shape (n, M), whatever moves it.
 
-    The velocity is that of frequencies up to ``VELOCITY_BAND`` times `highest`, Hz; beyond its ends
-    the record goes on mirrored in its first and last point.
+    The velocity is that of frequencies up to ``VELOCITY_BAND`` times `highest`, Hz, or as many more
+    as its noise allows; beyond its ends the record goes on mirrored in its first and last point.
     """
     position = experiment.position - experiment.position[0]
     turned = 2.0 * position[-1] - position[-2::-1]
@@ -181,10 +182,15 @@ def signs_of_velocity(experiment: Experiment, step: float, highest: float) -> Fl
     rise = 2.0 * position[-1] / count
     spectrum = np.fft.rfft(there_and_back - np.outer(np.arange(count), rise), axis=0)
     frequencies = np.arange(spectrum.shape[0]) / (count * step)
-    spectrum[frequencies > VELOCITY_BAND * highest] = 0.0
+    spectrum[frequencies[:, None] > _band(experiment, step, highest)] = 0.0
     velocity = np.fft.irfft(2j * np.pi * frequencies[:, None] * spectrum, count, axis=0)
     signs: FloatArray = np.sign(velocity + rise / step)[: position.shape[0]]
     return signs
+
+
+def _band(experiment: Experiment, step: float, highest: float) -> FloatArray:
+    """Highest frequency that each motor's velocity keeps, Hz, shape (M,)."""
+    return velocity_band(experiment.position, step, VELOCITY_BAND * highest)
 
 
 def _drift(experiment: Experiment, step: float) -> FloatArray:
