@@ -72,7 +72,7 @@ def test_phasors_without_friction_are_those_of_the_linear_machine(
         "slide", ("a",), ("a",), (), lines / (SAMPLES * STEP), spectra[0][:, None],
         spectra[1][:, None], np.broadcast_to(np.eye(2) * 1e-8, (5, 2, 2)).astype(complex),
     )  # fmt: skip
-    (freed,) = without_dry_friction([phasors], [experiment], STEP, [0.8])
+    (freed,) = without_dry_friction([phasors], [experiment], STEP, [0.8], np.zeros(1))
     omega = 2 * np.pi * lines
     linear = (-MASS * omega**2 + 1j * omega * VISCOUS) * phasors.position[:, 0]
     before = np.abs(phasors.torque[:, 0] - linear).max()

@@ -232,7 +232,7 @@ def test_signs_of_velocity(fresh_rng):
     velocity = 2 * np.pi * np.cos(angle).sum(axis=1) + 0.3
     noisy = position + 1e-5 * fresh_rng.normal(size=time.size)
     one = Experiment("m", "other", ("x",), (), None, time, noisy[:, None], 0 * noisy[:, None])
-    signs = signs_of_velocity(one, STEP, 3.3)[:, 0]
+    signs = signs_of_velocity(one, STEP, 3.3, np.zeros(1))[:, 0]
     clear = np.abs(velocity) > 0.02 * np.abs(velocity).max()
     end = int(1 / (VELOCITY_BAND * 3.3 * STEP))  # a period of the fastest that is kept
     assert np.mean(signs != np.sign(velocity)) < 0.02

@@ -7,7 +7,9 @@ the lines of sign(velocity), which the measured position gives::
 
     T(k) - G(jw_k)**-1 Theta(k) = Fc_i S_i(k) + c_i V_i(k)
 
-V, the velocity, takes back what the fit of a linear model has put down to viscous friction.
+V, the velocity, takes back what the fit of a linear model has put down to viscous friction.  Torque
+acts, or the position is told, later by a delay; friction acts with the motion itself.  So the sign
+is that of the velocity one delay after the torque it is compared with.
 Valid for: friction at the motors, motion that reverses; a motor that never reverses shows a constant.
 """
 
@@ -81,7 +83,7 @@ def dry_friction(
     model, delays
         Linear model of the machine, and its delays (M,), s.
     """
-    lines = [_lines(e, sample_period, band) for e in experiments]
+    lines = [_lines(e, sample_period, band, delays) for e in experiments]
     estimates, shares = [], []
     left = [_left(one, model, delays) for one in lines]
     for k in range(len(model.axes)):
@@ -100,6 +102,7 @@ def without_dry_friction(
     experiments: Sequence[Experiment],
     sample_period: float,
     friction: Sequence[float],
+    delays: FloatArray,
 ) -> tuple[Phasors, ...]:
     """Return phasors whose torque lacks the friction's share.
 
@@ -111,11 +114,13 @@ def without_dry_friction(
         s.
     friction
         Fc of each axis, N m or N.
+    delays
+        Of each axis, shape (M,), s.
     """
     freed = []
     for one, experiment in zip(phasors, experiments, strict=True):
         band = (float(one.frequencies.min()), float(one.frequencies.max()))
-        sign = _sign_lines(experiment, sample_period, band)
+        sign = _sign_lines(experiment, sample_period, band, delays)
         period = float(experiment.period or 0.0)
         places = np.round(one.frequencies * period).astype(np.intp) - 1
         torque = one.torque - sign[places] * np.asarray(friction)
@@ -123,7 +128,9 @@ def without_dry_friction(
     return tuple(freed)
 
 
-def _lines(experiment: Experiment, step: float, band: tuple[float, float]) -> _Lines:
+def _lines(
+    experiment: Experiment, step: float, band: tuple[float, float], delays: FloatArray
+) -> _Lines:
     period = float(experiment.period or 0.0)
     position, torque = (
         _period_mean(values, period, step) for values in (experiment.position, experiment.torque)
@@ -132,7 +139,7 @@ def _lines(experiment: Experiment, step: float, band: tuple[float, float]) -> _L
     spectra = [np.fft.rfft(v, axis=0)[1 : count // 2] * (2 / count) for v in (position, torque)]
     frequencies = np.arange(1, count // 2) / period
     inside = (frequencies >= band[0] * (1 - 1e-9)) & (frequencies <= band[1] * (1 + 1e-9))
-    sign = _sign_lines(experiment, step, band)
+    sign = _sign_lines(experiment, step, band, delays)
     return _Lines(
         2 * np.pi * frequencies[inside],
         spectra[0][inside],
@@ -155,22 +162,26 @@ def _period_mean(values: FloatArray, period: float, step: float) -> FloatArray:
     return np.asarray(cut[0], dtype=np.float64)
 
 
-def _sign_lines(experiment: Experiment, step: float, band: tuple[float, float]) -> ComplexArray:
-    """Lines 1 ... of the sign of each motor's velocity, peak phasors, shape (K, M)."""
+def _sign_lines(
+    experiment: Experiment, step: float, band: tuple[float, float], delays: FloatArray
+) -> ComplexArray:
+    """Lines 1 ... of the sign of each motor's velocity a delay later, peak phasors, shape (K, M)."""
     period = float(experiment.period or 0.0)
     position = _period_mean(experiment.position, period, step)
     count = position.shape[0]
     spectrum = np.fft.rfft(position, axis=0)
     frequencies = np.arange(spectrum.shape[0]) / period
     spectrum[frequencies[:, None] > _band(experiment, step, band[1])] = 0.0
-    velocity = np.fft.irfft(2j * np.pi * frequencies[:, None] * spectrum, count, axis=0)
+    velocity = np.fft.irfft(_derived(spectrum, frequencies, delays), count, axis=0)
     velocity += _drift(experiment, step)
     lines: ComplexArray = np.fft.rfft(np.sign(velocity), axis=0)[1 : count // 2] * (2 / count)
     return lines
 
 
-def signs_of_velocity(experiment: Experiment, step: float, highest: float) -> FloatArray:
-    """Return the sign of each motor's velocity in every row, shape (n, M), whatever moves it.
+def signs_of_velocity(
+    experiment: Experiment, step: float, highest: float, delays: FloatArray
+) -> FloatArray:
+    """Return the sign of each motor's velocity, a delay after each row, shape (n, M).
 
     The velocity is that of frequencies up to ``VELOCITY_BAND`` times `highest`, Hz, or as many more
     as its noise allows; beyond its ends the record goes on mirrored in its first and last point.
@@ -183,9 +194,16 @@ def signs_of_velocity(experiment: Experiment, step: float, highest: float) -> Fl
     spectrum = np.fft.rfft(there_and_back - np.outer(np.arange(count), rise), axis=0)
     frequencies = np.arange(spectrum.shape[0]) / (count * step)
     spectrum[frequencies[:, None] > _band(experiment, step, highest)] = 0.0
-    velocity = np.fft.irfft(2j * np.pi * frequencies[:, None] * spectrum, count, axis=0)
+    velocity = np.fft.irfft(_derived(spectrum, frequencies, delays), count, axis=0)
     signs: FloatArray = np.sign(velocity + rise / step)[: position.shape[0]]
     return signs
+
+
+def _derived(spectrum: ComplexArray, frequencies: FloatArray, delays: FloatArray) -> ComplexArray:
+    """Spectra of velocities, each a delay later."""
+    rates = 2j * np.pi * frequencies[:, None]
+    out: ComplexArray = rates * np.exp(rates * delays) * spectrum
+    return out
 
 
 def _band(experiment: Experiment, step: float, highest: float) -> FloatArray:

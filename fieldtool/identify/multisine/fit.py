@@ -83,7 +83,9 @@ class JointFit:
                 break
             taken[list(seen)] = [friction.torque[k].value for k in seen]
             fitted_ones = [self._settled[one.experiment] for one in self._phasors]
-            freed = without_dry_friction(self._phasors, fitted_ones, self._step, taken.tolist())
+            freed = without_dry_friction(
+                self._phasors, fitted_ones, self._step, taken.tolist(), fitted.delay_values
+            )
             fitted = self._weighted(fitted, freed)
             friction = self._friction(fitted)
         return fitted, friction

@@ -176,7 +176,7 @@ def _explained(
         if np.all(np.abs(new - taken) <= FRICTION_SETTLED * np.abs(new)):
             break
         taken = new
-        freed = without_dry_friction(phasors, steady, step, taken.tolist())
+        freed = without_dry_friction(phasors, steady, step, taken.tolist(), fitted.delay_values)
     notes += said
     return found
 

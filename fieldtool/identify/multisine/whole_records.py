@@ -92,8 +92,9 @@ class WholeRecords:
         run_in
             Whether what comes before the whole periods is in.
         """
-        between = [self._spectrum(one, run_in=False, beyond=True) for one in self.lines]
-        wide = [self._spectrum(one, run_in=run_in, beyond=False) for one in self.lines]
+        delays = found.delay_values
+        between = [self._spectrum(one, delays, run_in=False, beyond=True) for one in self.lines]
+        wide = [self._spectrum(one, delays, run_in=run_in, beyond=False) for one in self.lines]
         rough = tuple(self._rough(*each, found) for each in zip(self.lines, between, strict=True))
         told = RecordData(self.recording.names, tuple(between), rough)
         seen = told.systems(found.model, found.delay_values)
@@ -108,14 +109,16 @@ class WholeRecords:
         data = RecordData(self.recording.names, tuple(wide), errors, self._parts(run_in))
         return replace(data, spread=_spread(data.systems(found.model, found.delay_values), groups))
 
-    def _spectrum(self, one: LinePhasors, *, run_in: bool, beyond: bool) -> Spectrum:
+    def _spectrum(
+        self, one: LinePhasors, delays: FloatArray, *, run_in: bool, beyond: bool
+    ) -> Spectrum:
         """Spectrum up to the highest line, or as far beyond it as the noise is wanted."""
         experiment, step = one.given.experiment, self.recording.sample_period
         torque = experiment.torque.copy()
         for fold, size in self.folds:
             torque[:, fold.axis] -= fold.course(self._reference(one, fold.axis), size)
         if np.any(self.friction):
-            signs = signs_of_velocity(experiment, step, float(one.frequencies[-1]))
+            signs = signs_of_velocity(experiment, step, float(one.frequencies[-1]), delays)
             torque = torque - signs * self.friction
         M = len(self.recording.axes)
         signals, bins = self._cut(one, np.hstack([experiment.position, torque]), run_in, beyond)
