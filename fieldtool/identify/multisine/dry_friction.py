@@ -53,11 +53,13 @@ class DryFriction:
 
 
 @dataclass(frozen=True, eq=False)
-class _Lines:
-    """One experiment at all lines of its band."""
+class SignLines:
+    """One experiment at all lines of its band: peak phasors."""
 
     omega: FloatArray
+    """(K,), rad/s."""
     position: ComplexArray
+    """(K, M)."""
     torque: ComplexArray
     sign: ComplexArray
     """Of the velocities, shape (K, M)."""
@@ -83,7 +85,7 @@ def dry_friction(
     model, delays
         Linear model of the machine, and its delays (M,), s.
     """
-    lines = [_lines(e, sample_period, band, delays) for e in experiments]
+    lines = [lines_of_signs(e, sample_period, band, delays) for e in experiments]
     estimates, shares = [], []
     left = [_left(one, model, delays) for one in lines]
     for k in range(len(model.axes)):
@@ -128,9 +130,10 @@ def without_dry_friction(
     return tuple(freed)
 
 
-def _lines(
+def lines_of_signs(
     experiment: Experiment, step: float, band: tuple[float, float], delays: FloatArray
-) -> _Lines:
+) -> SignLines:
+    """Return all lines of the band of one experiment's last whole periods, excited or not."""
     period = float(experiment.period or 0.0)
     position, torque = (
         _period_mean(values, period, step) for values in (experiment.position, experiment.torque)
@@ -140,7 +143,7 @@ def _lines(
     frequencies = np.arange(1, count // 2) / period
     inside = (frequencies >= band[0] * (1 - 1e-9)) & (frequencies <= band[1] * (1 + 1e-9))
     sign = _sign_lines(experiment, step, band, delays)
-    return _Lines(
+    return SignLines(
         2 * np.pi * frequencies[inside],
         spectra[0][inside],
         spectra[1][inside],
@@ -222,7 +225,7 @@ def _drift(experiment: Experiment, step: float) -> FloatArray:
     return drift
 
 
-def _left(lines: _Lines, model: MachineModel, delays: FloatArray) -> ComplexArray:
+def _left(lines: SignLines, model: MachineModel, delays: FloatArray) -> ComplexArray:
     """Torque that the model does not explain, shape (K, M)."""
     response = machine_response(model, lines.omega, delays)
     explained = np.linalg.solve(response, lines.position[:, :, None])[:, :, 0]

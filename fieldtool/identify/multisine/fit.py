@@ -72,28 +72,33 @@ class JointFit:
         self._settled = {one.name: settled(one, self._step) for one in everything}
         self._omega = frequencies_of(phasors)
 
-    def run(self, start: RefinedModel) -> tuple[RefinedModel, DryFriction]:
-        """Return the fitted machine, and the dry friction beside it."""
-        fitted = self._weighted(start, self._phasors)
+    def run(self, start: RefinedModel, friction: DryFriction) -> tuple[RefinedModel, DryFriction]:
+        """Return the fitted machine, and the dry friction beside it; `friction`: as known before."""
+        fitted = self._weighted(start, self._freed(start, friction))
         friction = self._friction(fitted)
-        taken = np.zeros(len(friction.axes))
         for _ in range(FRICTION_ROUNDS):
-            seen = friction.seen(SEEN)
-            if not seen:
+            if not friction.seen(SEEN):
                 break
-            taken[list(seen)] = [friction.torque[k].value for k in seen]
-            fitted_ones = [self._settled[one.experiment] for one in self._phasors]
-            freed = without_dry_friction(
-                self._phasors, fitted_ones, self._step, taken.tolist(), fitted.delay_values
-            )
-            fitted = self._weighted(fitted, freed)
+            fitted = self._weighted(fitted, self._freed(fitted, friction))
             friction = self._friction(fitted)
         return fitted, friction
 
-    def unexplained(self, fitted: RefinedModel) -> float:
-        """Return the share of the motion, in standard errors, that the machine does not explain."""
+    def _freed(self, fitted: RefinedModel, friction: DryFriction) -> Sequence[Phasors]:
+        """Return the phasors less the friction that is seen."""
+        taken = np.zeros(len(friction.axes))
+        for k in friction.seen(SEEN):
+            taken[k] = friction.torque[k].value
+        if not np.any(taken):
+            return self._phasors
+        ones = [self._settled[one.experiment] for one in self._phasors]
+        return without_dry_friction(
+            self._phasors, ones, self._step, taken.tolist(), fitted.delay_values
+        )
+
+    def unexplained(self, fitted: RefinedModel, friction: DryFriction) -> float:
+        """Return the share of the motion, in standard errors, that neither of the two explains."""
         response = machine_response(fitted.model, self._omega, fitted.delay_values)
-        data = joint_spectra(self._phasors, response)
+        data = joint_spectra(self._freed(fitted, friction), response)
         left, moved = data.residuals(response), data.residuals(np.zeros_like(response))
         return float(np.linalg.norm(left) / np.linalg.norm(moved))
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from fieldtool.errors import IdentificationError
 from fieldtool.frf.from_matrix import locked_responses
+from fieldtool.frf.multisine.distortion import joint_distortion
 from fieldtool.frf.multisine.matrix import JointResult, joint_response
 from fieldtool.frf.response import FrequencyResponse
 from fieldtool.identify.chains.order import OrderSelection
@@ -26,6 +27,7 @@ from fieldtool.identify.multisine.dry_friction import (
 )
 from fieldtool.identify.multisine.fit import JointFit, first_fit, with_free_motion
 from fieldtool.identify.multisine.lines import lines_of
+from fieldtool.identify.multisine.local_friction import local_friction, without_local_friction
 from fieldtool.identify.multisine.notes import (
     cross_check,
     friction_notes,
@@ -34,7 +36,7 @@ from fieldtool.identify.multisine.notes import (
     structure_notes,
     transient_note,
 )
-from fieldtool.identify.multisine.records import check_alive, moving_on, with_periods
+from fieldtool.identify.multisine.records import check_alive, moving_on, settled, with_periods
 from fieldtool.identify.multisine.whole_records import WholeRecords
 from fieldtool.records.model import Estimate, Kind, MachineModel
 from fieldtool.records.recording import Experiment, Recording
@@ -99,7 +101,7 @@ def identify_joint(
     check_alive(recording)
     used = moving_on(recording)
     complete, single = _sets(used)
-    measured = joint_response(used, complete)
+    early, measured = _freed_response(used, complete, (*(complete or ()), *single))
     lines = (*measured.lines, *lines_of(used, single))
     data = matrix_of(measured.response)
     notes = list(measured.notes)
@@ -118,11 +120,11 @@ def identify_joint(
         priors = {f"{name}.mass[1]": mass for name, mass in (motor_masses or {}).items()}
         fit = JointFit([one.phasors(recording.names) for one in lines], recording, priors)
         first = first_fit(starts(start, modal, prior, kinds), data, priors)
-        fitted, friction = fit.run(first)
+        fitted, friction = fit.run(first, early)
         fitted, whole = with_free_motion(
             fitted, WholeRecords.of(recording, lines, friction), priors
         )
-        _check_explained(fit.unexplained(fitted), friction)
+        _check_explained(fit.unexplained(fitted, friction), friction)
     notes += structure_notes(reduced, fitted, whole)
     notes += mode_notes(order, fitted, whole, data.omega.size)
     notes += transient_note(measured, data, fitted)
@@ -161,6 +163,34 @@ def _told_of_distortion(measured: JointResult) -> Iterator[None]:
                 "larger amplitude or on top of a constant velocity, and check the axis for play."
             )
         raise
+
+
+def _freed_response(
+    recording: Recording,
+    complete: tuple[Experiment, ...] | None,
+    experiments: tuple[Experiment, ...],
+) -> tuple[DryFriction, JointResult]:
+    """Return the dry friction that the data show of themselves, and the response without it.
+
+    Lines and distortion are those of the data as measured.
+    """
+    names, step = recording.names, recording.sample_period
+    nothing = DryFriction(names, (Estimate(0.0),) * len(names), np.zeros(len(names)))
+    if complete is None:
+        return nothing, joint_response(recording)
+    lines = lines_of(recording, complete)
+    excited = np.concatenate([one.phasors(names).frequencies for one in lines])
+    band = (float(excited.min()), float(excited.max()))
+    early = local_friction(names, [settled(one, step) for one in experiments], step, band)
+    seen = early.seen(SEEN)
+    if not seen:
+        return early, joint_response(recording, complete)
+    freed = without_local_friction(recording, early, seen, band[1])
+    straight = {one.name: one for one in freed.experiments}
+    measured = joint_response(freed, tuple(straight[one.name] for one in complete))
+    bent = joint_distortion(lines, measured.response)
+    notes = (*measured.notes, *(one.sentence for one in bent if one.worth_saying))
+    return early, replace(measured, lines=lines, distortion=bent, notes=notes)
 
 
 def _responses(solved: FrequencyResponse) -> dict[str, FrequencyResponse]:
