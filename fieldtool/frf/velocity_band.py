@@ -15,6 +15,8 @@ UNSURE = 3.0
 """Standard errors of the velocity below which an axis may be standing."""
 STOPPED = 2e-3
 """Share of the fastest velocity below which an axis may be standing."""
+NOISY = 1e-2
+"""Share of the fastest velocity that its noise may hide, UNSURE standard errors of it."""
 HIGHEST = 0.8
 """Of half the sampling rate."""
 
@@ -44,14 +46,14 @@ def velocity_band(position: FloatArray, step: float, least: float) -> FloatArray
 
     Notes
     -----
-    The velocity's noise is then ``STOPPED / UNSURE`` of the fastest velocity; that of an encoder is
+    The velocity's noise is then ``NOISY / UNSURE`` of the fastest velocity; that of an encoder is
     no less than one of its steps makes, divided by sqrt(12).
     """
     moves = np.abs(np.diff(position, axis=0))
     counts = np.min(moves, axis=0, where=moves > 0, initial=np.inf)
     noise = np.maximum(white_noise(position), np.where(np.isfinite(counts), counts, 0.0) / 12**0.5)
     fastest = np.quantile(moves, 0.99, axis=0) / step
-    allowed = STOPPED / UNSURE * fastest
+    allowed = NOISY / UNSURE * fastest
     unit = np.maximum(velocity_noise(noise, np.ones_like(noise), step), 1e-300)
     band = np.minimum((allowed / unit) ** (2 / 3), HIGHEST / (2 * step))
     return np.asarray(np.maximum(band, min(least, HIGHEST / (2 * step))), dtype=np.float64)

@@ -18,7 +18,7 @@ from fieldtool.identify.likelihood.record_data import RecordData
 from fieldtool.identify.likelihood.record_spectrum import Spectrum, spectrum_of
 from fieldtool.identify.likelihood.refine import RefinedModel, machine_response, refine
 from fieldtool.identify.modes.scan import noise_limit
-from fieldtool.identify.multisine.dry_friction import VELOCITY_BAND, signs_of_velocity
+from fieldtool.identify.multisine.sliding import HARMONICS, directions
 from fieldtool.identify.multisine.whole_records import WholeRecords
 from fieldtool.records.closed_loop import AxisLoop, Biquad, ClosedLoop
 from fieldtool.records.model import Estimate, MachineModel
@@ -224,7 +224,7 @@ def cut(one, rows):
     )
 
 
-def test_signs_of_velocity(fresh_rng):
+def test_directions_of_a_whole_record(fresh_rng):
     time = np.arange(3000) * STEP
     rates, phases = np.array([0.7, 1.9, 3.3]), fresh_rng.uniform(0, 6.0, 3)
     angle = 2 * np.pi * np.outer(time, rates) + phases
@@ -232,9 +232,9 @@ def test_signs_of_velocity(fresh_rng):
     velocity = 2 * np.pi * np.cos(angle).sum(axis=1) + 0.3
     noisy = position + 1e-5 * fresh_rng.normal(size=time.size)
     one = Experiment("m", "other", ("x",), (), None, time, noisy[:, None], 0 * noisy[:, None])
-    signs = signs_of_velocity(one, STEP, 3.3, np.zeros(1))[:, 0]
+    signs = directions(one, STEP, 3.3, np.zeros(1))[:, 0]
     clear = np.abs(velocity) > 0.02 * np.abs(velocity).max()
-    end = int(1 / (VELOCITY_BAND * 3.3 * STEP))  # a period of the fastest that is kept
+    end = int(1 / (HARMONICS * 3.3 * STEP))  # a period of the fastest that is kept
     assert np.mean(signs != np.sign(velocity)) < 0.02
     clear[:end] = clear[-end:] = False
     assert np.array_equal(signs[clear], np.sign(velocity[clear]))

@@ -7,9 +7,8 @@ the lines of sign(velocity), which the measured position gives::
 
     T(k) - G(jw_k)**-1 Theta(k) = Fc_i S_i(k) + c_i V_i(k)
 
-V, the velocity, takes back what the fit of a linear model has put down to viscous friction.  Torque
-acts, or the position is told, later by a delay; friction acts with the motion itself.  So the sign
-is that of the velocity one delay after the torque it is compared with.
+V, the velocity, takes back what the fit of a linear model has put down to viscous friction.  Where a
+motor may stand there is no sign; what friction holds it is found from the model in hand.
 Valid for: friction at the motors, motion that reverses; a motor that never reverses shows a constant.
 """
 
@@ -20,15 +19,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fieldtool.frf.phasors import Phasors
-from fieldtool.frf.velocity_band import velocity_band
 from fieldtool.identify.likelihood.refine import machine_response
+from fieldtool.identify.multisine.sliding import Sliding
 from fieldtool.records.model import Estimate, MachineModel
 from fieldtool.records.recording import Experiment
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
-VELOCITY_BAND = 3.0
-"""Velocity is of the position's lines up to so many times the highest excited one at least."""
+LEFT_AT_TURNS = 0.05
+"""Standard error of friction while a motor stands, that goes with its acceleration, over Fc."""
 SEEN = 5.0
 """Standard errors from which dry friction is taken off before a fit."""
 
@@ -43,6 +42,13 @@ class DryFriction:
     share: FloatArray
     """Fc over the root mean square of the torque, shape (M,)."""
 
+    def sizes(self, standard_errors: float) -> FloatArray:
+        """Return Fc of the axes whose friction stands out of its error by so much, else 0; (M,)."""
+        sizes = np.zeros(len(self.axes))
+        for k in self.seen(standard_errors):
+            sizes[k] = self.torque[k].value
+        return sizes
+
     def seen(self, standard_errors: float) -> tuple[int, ...]:
         """Return the axes whose friction stands out of its error by so much."""
         return tuple(
@@ -53,7 +59,7 @@ class DryFriction:
 
 
 @dataclass(frozen=True, eq=False)
-class SignLines:
+class SlidingLines:
     """One experiment at all lines of its band: peak phasors."""
 
     omega: FloatArray
@@ -62,7 +68,10 @@ class SignLines:
     """(K, M)."""
     torque: ComplexArray
     sign: ComplexArray
-    """Of the velocities, shape (K, M)."""
+    """Of the velocities, 0 where a motor may stand, (K, M)."""
+    inside: NDArray[np.bool_]
+    """Which of the period's lines these are."""
+    sliding: Sliding
 
 
 def dry_friction(
@@ -71,6 +80,7 @@ def dry_friction(
     band: tuple[float, float],
     model: MachineModel,
     delays: FloatArray,
+    before: FloatArray | None = None,
 ) -> DryFriction:
     """Estimate Fc of every axis from periodic experiments.
 
@@ -84,10 +94,13 @@ def dry_friction(
         Lowest and highest excited frequency, Hz.
     model, delays
         Linear model of the machine, and its delays (M,), s.
+    before
+        Fc as known before, (M,): it bounds what friction a motor that stands can have.
     """
-    lines = [lines_of_signs(e, sample_period, band, delays) for e in experiments]
+    known = np.zeros(len(model.axes)) if before is None else before
+    lines = [sliding_lines(e, sample_period, band, delays) for e in experiments]
     estimates, shares = [], []
-    left = [_left(one, model, delays) for one in lines]
+    left = [_left(one, model, delays, known) for one in lines]
     for k in range(len(model.axes)):
         rows = [
             np.column_stack([one.sign[:, k], 1j * one.omega * one.position[:, k]]) for one in lines
@@ -99,11 +112,42 @@ def dry_friction(
     return DryFriction(model.names, tuple(estimates), np.array(shares))
 
 
+def mass_left_unsure(
+    experiments: Sequence[Experiment],
+    sample_period: float,
+    highest: float,
+    friction: DryFriction,
+    delays: FloatArray,
+) -> FloatArray:
+    """Return the standard error of each motor's mass that its friction at the turns makes, (M,).
+
+    What friction is while a motor stands is known only in part; that part of it goes with the
+    acceleration, in all lines alike, so no misfit shows it.  ``LEFT_AT_TURNS`` of Fc, for the share of
+    rows in which a motor may stand, over the acceleration's root mean square.
+    """
+    sizes, M = friction.sizes(SEEN), len(friction.axes)
+    if not np.any(sizes):
+        return np.zeros(M)
+    stands, square = [], []
+    for one in experiments:
+        sliding = Sliding.of(one, sample_period, highest, delays)
+        stands.append(np.mean(sliding.direction == 0, axis=0))
+        kept = sliding.frequencies <= highest
+        rates = (2 * np.pi * sliding.frequencies[kept, None]) ** 2
+        square.append(
+            np.sum(np.abs(rates * sliding.lines(sliding.position)[kept]) ** 2, axis=0) / 2
+        )
+    moved = np.sqrt(np.mean(square, axis=0))
+    out: FloatArray = LEFT_AT_TURNS * sizes * np.mean(stands, axis=0) / np.maximum(moved, 1e-300)
+    return out
+
+
 def without_dry_friction(
     phasors: Sequence[Phasors],
     experiments: Sequence[Experiment],
     sample_period: float,
-    friction: Sequence[float],
+    friction: FloatArray,
+    model: MachineModel,
     delays: FloatArray,
 ) -> tuple[Phasors, ...]:
     """Return phasors whose torque lacks the friction's share.
@@ -115,121 +159,41 @@ def without_dry_friction(
     sample_period
         s.
     friction
-        Fc of each axis, N m or N.
-    delays
-        Of each axis, shape (M,), s.
+        Fc of each axis, (M,), N m or N.
+    model, delays
+        Tell what friction holds a motor that stands; delays (M,), s.
     """
     freed = []
     for one, experiment in zip(phasors, experiments, strict=True):
-        band = (float(one.frequencies.min()), float(one.frequencies.max()))
-        sign = _sign_lines(experiment, sample_period, band, delays)
-        period = float(experiment.period or 0.0)
-        places = np.round(one.frequencies * period).astype(np.intp) - 1
-        torque = one.torque - sign[places] * np.asarray(friction)
-        freed.append(replace(one, torque=torque))
+        sliding = Sliding.of(experiment, sample_period, float(one.frequencies.max()), delays)
+        course = sliding.direction * friction + sliding.standing(model, delays, friction)
+        places = np.round(one.frequencies * float(experiment.period or 0.0)).astype(np.intp) - 1
+        freed.append(replace(one, torque=one.torque - sliding.lines(course)[places]))
     return tuple(freed)
 
 
-def lines_of_signs(
+def sliding_lines(
     experiment: Experiment, step: float, band: tuple[float, float], delays: FloatArray
-) -> SignLines:
+) -> SlidingLines:
     """Return all lines of the band of one experiment's last whole periods, excited or not."""
-    period = float(experiment.period or 0.0)
-    position, torque = (
-        _period_mean(values, period, step) for values in (experiment.position, experiment.torque)
-    )
-    count = position.shape[0]
-    spectra = [np.fft.rfft(v, axis=0)[1 : count // 2] * (2 / count) for v in (position, torque)]
-    frequencies = np.arange(1, count // 2) / period
+    sliding = Sliding.of(experiment, step, band[1], delays)
+    frequencies = sliding.frequencies
     inside = (frequencies >= band[0] * (1 - 1e-9)) & (frequencies <= band[1] * (1 + 1e-9))
-    sign = _sign_lines(experiment, step, band, delays)
-    return SignLines(
-        2 * np.pi * frequencies[inside],
-        spectra[0][inside],
-        spectra[1][inside],
-        sign[: inside.size][inside],
+    position, torque, sign = (
+        sliding.lines(values)[inside]
+        for values in (sliding.position, sliding.torque, sliding.direction)
     )
+    return SlidingLines(2 * np.pi * frequencies[inside], position, torque, sign, inside, sliding)
 
 
-def _period_mean(values: FloatArray, period: float, step: float) -> FloatArray:
-    """Mean of the last whole periods, the straight drift over them taken off, shape (N, M)."""
-    samples = round(period / step)
-    whole = values.shape[0] // samples
-    cut = values[values.shape[0] - whole * samples :].reshape(whole, samples, -1)
-    if whole > 1:
-        index = np.arange(whole) - (whole - 1) / 2
-        slope = np.tensordot(index, cut.mean(axis=1), axes=1) / (index @ index)
-        ramp = (np.arange(samples) - (samples - 1) / 2) / samples
-        mean: FloatArray = cut.mean(axis=0) - np.outer(ramp, slope)
-        return mean
-    return np.asarray(cut[0], dtype=np.float64)
-
-
-def _sign_lines(
-    experiment: Experiment, step: float, band: tuple[float, float], delays: FloatArray
+def _left(
+    lines: SlidingLines, model: MachineModel, delays: FloatArray, known: FloatArray
 ) -> ComplexArray:
-    """Lines 1 ... of the sign of each motor's velocity a delay later, peak phasors, shape (K, M)."""
-    period = float(experiment.period or 0.0)
-    position = _period_mean(experiment.position, period, step)
-    count = position.shape[0]
-    spectrum = np.fft.rfft(position, axis=0)
-    frequencies = np.arange(spectrum.shape[0]) / period
-    spectrum[frequencies[:, None] > _band(experiment, step, band[1])] = 0.0
-    velocity = np.fft.irfft(_derived(spectrum, frequencies, delays), count, axis=0)
-    velocity += _drift(experiment, step)
-    lines: ComplexArray = np.fft.rfft(np.sign(velocity), axis=0)[1 : count // 2] * (2 / count)
-    return lines
-
-
-def signs_of_velocity(
-    experiment: Experiment, step: float, highest: float, delays: FloatArray
-) -> FloatArray:
-    """Return the sign of each motor's velocity, a delay after each row, shape (n, M).
-
-    The velocity is that of frequencies up to ``VELOCITY_BAND`` times `highest`, Hz, or as many more
-    as its noise allows; beyond its ends the record goes on mirrored in its first and last point.
-    """
-    position = experiment.position - experiment.position[0]
-    turned = 2.0 * position[-1] - position[-2::-1]
-    there_and_back = np.concatenate([position, turned])[:-1]  # rises by twice the last value
-    count = there_and_back.shape[0]
-    rise = 2.0 * position[-1] / count
-    spectrum = np.fft.rfft(there_and_back - np.outer(np.arange(count), rise), axis=0)
-    frequencies = np.arange(spectrum.shape[0]) / (count * step)
-    spectrum[frequencies[:, None] > _band(experiment, step, highest)] = 0.0
-    velocity = np.fft.irfft(_derived(spectrum, frequencies, delays), count, axis=0)
-    signs: FloatArray = np.sign(velocity + rise / step)[: position.shape[0]]
-    return signs
-
-
-def _derived(spectrum: ComplexArray, frequencies: FloatArray, delays: FloatArray) -> ComplexArray:
-    """Spectra of velocities, each a delay later."""
-    rates = 2j * np.pi * frequencies[:, None]
-    out: ComplexArray = rates * np.exp(rates * delays) * spectrum
-    return out
-
-
-def _band(experiment: Experiment, step: float, highest: float) -> FloatArray:
-    """Highest frequency that each motor's velocity keeps, Hz, shape (M,)."""
-    return velocity_band(experiment.position, step, VELOCITY_BAND * highest)
-
-
-def _drift(experiment: Experiment, step: float) -> FloatArray:
-    """Mean velocity over the last whole periods, shape (M,): a bias velocity."""
-    samples = round(float(experiment.period or 0.0) / step)
-    whole = experiment.samples // samples
-    if whole < 2:
-        return np.zeros(experiment.position.shape[1])
-    rows = experiment.position[-whole * samples :].reshape(whole, samples, -1).mean(axis=1)
-    drift: FloatArray = (rows[-1] - rows[0]) / ((whole - 1) * samples * step)
-    return drift
-
-
-def _left(lines: SignLines, model: MachineModel, delays: FloatArray) -> ComplexArray:
-    """Torque that the model does not explain, shape (K, M)."""
+    """Torque that neither the model nor motors that stand explain, shape (K, M)."""
     response = machine_response(model, lines.omega, delays)
     explained = np.linalg.solve(response, lines.position[:, :, None])[:, :, 0]
-    left: ComplexArray = lines.torque - explained
+    standing = lines.sliding.standing(model, delays, known)
+    left: ComplexArray = lines.torque - explained - lines.sliding.lines(standing)[lines.inside]
     return left
 
 

@@ -16,6 +16,7 @@ from fieldtool.identify.multisine.dry_friction import (
     SEEN,
     DryFriction,
     dry_friction,
+    mass_left_unsure,
     without_dry_friction,
 )
 from fieldtool.identify.multisine.records import settled
@@ -75,25 +76,39 @@ class JointFit:
     def run(self, start: RefinedModel, friction: DryFriction) -> tuple[RefinedModel, DryFriction]:
         """Return the fitted machine, and the dry friction beside it; `friction`: as known before."""
         fitted = self._weighted(start, self._freed(start, friction))
-        friction = self._friction(fitted)
+        friction = self._friction(fitted, friction)
         for _ in range(FRICTION_ROUNDS):
             if not friction.seen(SEEN):
                 break
             fitted = self._weighted(fitted, self._freed(fitted, friction))
-            friction = self._friction(fitted)
+            friction = self._friction(fitted, friction)
         return fitted, friction
 
     def _freed(self, fitted: RefinedModel, friction: DryFriction) -> Sequence[Phasors]:
         """Return the phasors less the friction that is seen."""
-        taken = np.zeros(len(friction.axes))
-        for k in friction.seen(SEEN):
-            taken[k] = friction.torque[k].value
+        taken = friction.sizes(SEEN)
         if not np.any(taken):
             return self._phasors
         ones = [self._settled[one.experiment] for one in self._phasors]
         return without_dry_friction(
-            self._phasors, ones, self._step, taken.tolist(), fitted.delay_values
+            self._phasors, ones, self._step, taken, fitted.model, fitted.delay_values
         )
+
+    def with_turns(self, fitted: RefinedModel, friction: DryFriction) -> RefinedModel:
+        """Return the same with what friction at the turns adds to the errors of the motors' masses."""
+        ones, highest = tuple(self._settled.values()), float(self._omega[-1] / (2 * np.pi))
+        more = mass_left_unsure(ones, self._step, highest, friction, fitted.delay_values)
+        axes = tuple(
+            replace(
+                a,
+                masses=(
+                    replace(a.masses[0], std=float(np.hypot(a.masses[0].std, m))),
+                    *a.masses[1:],
+                ),
+            )
+            for a, m in zip(fitted.model.axes, more, strict=True)
+        )
+        return replace(fitted, model=replace(fitted.model, axes=axes))
 
     def unexplained(self, fitted: RefinedModel, friction: DryFriction) -> float:
         """Return the share of the motion, in standard errors, that neither of the two explains."""
@@ -102,10 +117,11 @@ class JointFit:
         left, moved = data.residuals(response), data.residuals(np.zeros_like(response))
         return float(np.linalg.norm(left) / np.linalg.norm(moved))
 
-    def _friction(self, fitted: RefinedModel) -> DryFriction:
+    def _friction(self, fitted: RefinedModel, before: DryFriction) -> DryFriction:
         band = (float(self._omega[0] / (2 * np.pi)), float(self._omega[-1] / (2 * np.pi)))
         settled_ones = list(self._settled.values())
-        return dry_friction(settled_ones, self._step, band, fitted.model, fitted.delay_values)
+        delays, known = fitted.delay_values, before.sizes(SEEN)
+        return dry_friction(settled_ones, self._step, band, fitted.model, delays, known)
 
     def _weighted(self, start: RefinedModel, phasors: Sequence[Phasors]) -> RefinedModel:
         """Fit, each time weighted anew, then once more without friction that is not seen."""

@@ -125,6 +125,7 @@ def identify_joint(
             fitted, WholeRecords.of(recording, lines, friction), priors
         )
         _check_explained(fit.unexplained(fitted, friction), friction)
+        fitted = fit.with_turns(fitted, friction)
     notes += structure_notes(reduced, fitted, whole)
     notes += mode_notes(order, fitted, whole, data.omega.size)
     notes += transient_note(measured, data, fitted)
@@ -182,14 +183,17 @@ def _freed_response(
     excited = np.concatenate([one.phasors(names).frequencies for one in lines])
     band = (float(excited.min()), float(excited.max()))
     early = local_friction(names, [settled(one, step) for one in experiments], step, band)
-    seen = early.seen(SEEN)
-    if not seen:
+    if not early.seen(SEEN):
         return early, joint_response(recording, complete)
-    freed = without_local_friction(recording, early, seen, band[1])
+    freed = without_local_friction(recording, early.sizes(SEEN), band[1])
     straight = {one.name: one for one in freed.experiments}
     measured = joint_response(freed, tuple(straight[one.name] for one in complete))
     bent = joint_distortion(lines, measured.response)
-    notes = (*measured.notes, *(one.sentence for one in bent if one.worth_saying))
+    left = {one.sentence for one in measured.distortion}
+    notes = (
+        *(note for note in measured.notes if note not in left),
+        *(one.sentence for one in bent if one.worth_saying),
+    )
     return early, replace(measured, lines=lines, distortion=bent, notes=notes)
 
 

@@ -26,9 +26,9 @@ from fieldtool.identify.multisine.dry_friction import (
     ComplexArray,
     DryFriction,
     FloatArray,
-    lines_of_signs,
-    signs_of_velocity,
+    sliding_lines,
 )
+from fieldtool.identify.multisine.sliding import directions
 from fieldtool.records.model import Estimate
 from fieldtool.records.recording import Experiment, Recording
 
@@ -78,7 +78,7 @@ def local_friction(
     for one in experiments:
         alike.setdefault(round(float(one.period or 0.0) / sample_period), []).append(one)
     lines = [
-        [lines_of_signs(one, sample_period, band, still) for one in members]
+        [sliding_lines(one, sample_period, band, still) for one in members]
         for members in alike.values()
     ]
     power = np.mean([np.sum(np.abs(o.torque) ** 2, axis=0) / 2 for g in lines for o in g], axis=0)
@@ -104,20 +104,16 @@ def local_friction(
     return DryFriction(tuple(axes), tuple(found), np.array(shares))
 
 
-def without_local_friction(
-    recording: Recording, friction: DryFriction, chosen: Sequence[int], highest: float
-) -> Recording:
-    """Return the recording with the friction of the chosen axes taken off all multisines' torques.
+def without_local_friction(recording: Recording, sizes: FloatArray, highest: float) -> Recording:
+    """Return the recording with friction of these sizes, (M,), taken off all multisines' torques.
 
-    `highest`: highest excited frequency, Hz.
+    `highest`: highest excited frequency, Hz.  Where a motor may stand, nothing is taken off.
     """
-    sizes = np.zeros(len(friction.axes))
-    sizes[list(chosen)] = [friction.torque[k].value for k in chosen]
 
     def freed(one: Experiment) -> Experiment:
         if one.kind != "multisine" or not one.complete:
             return one
-        signs = signs_of_velocity(one, recording.sample_period, highest, np.zeros(sizes.size))
+        signs = directions(one, recording.sample_period, highest, np.zeros(sizes.size))
         return replace(one, torque=one.torque - signs * sizes)
 
     return replace(recording, experiments=tuple(freed(one) for one in recording.experiments))

@@ -169,14 +169,14 @@ def _explained(
         fitted = _fitted(freed, prior, said)
         if fitted is None:
             break
-        friction = dry_friction(steady, step, band, fitted.model, fitted.delay_values)
+        model, delays = fitted.model, fitted.delay_values
+        friction = dry_friction(steady, step, band, model, delays, taken)
         found = fitted, friction
-        likely = friction.seen(FRICTION_TAKEN)
-        new = np.array([one.value if k in likely else 0.0 for k, one in enumerate(friction.torque)])
+        new = friction.sizes(FRICTION_TAKEN)
         if np.all(np.abs(new - taken) <= FRICTION_SETTLED * np.abs(new)):
             break
         taken = new
-        freed = without_dry_friction(phasors, steady, step, taken.tolist(), fitted.delay_values)
+        freed = without_dry_friction(phasors, steady, step, taken, model, delays)
     notes += said
     return found
 

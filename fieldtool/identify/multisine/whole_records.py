@@ -25,7 +25,9 @@ from fieldtool.identify.likelihood.record_spectrum import Spectrum, amplitudes, 
 from fieldtool.identify.likelihood.record_system import RecordSystem
 from fieldtool.identify.likelihood.refine import RefinedModel, machine_response
 from fieldtool.identify.likelihood.whitening import whitening
-from fieldtool.identify.multisine.dry_friction import SEEN, DryFriction, signs_of_velocity
+from fieldtool.identify.multisine.dry_friction import SEEN, DryFriction
+from fieldtool.identify.multisine.records import settled
+from fieldtool.identify.multisine.sliding import Sliding, directions
 from fieldtool.records.recording import Recording
 
 FloatArray = NDArray[np.float64]
@@ -63,10 +65,7 @@ class WholeRecords:
         cls, recording: Recording, lines: Sequence[LinePhasors], friction: DryFriction
     ) -> "WholeRecords":
         """Take off the dry friction that is seen."""
-        taken = np.zeros(len(recording.axes))
-        for k in friction.seen(SEEN):
-            taken[k] = friction.torque[k].value
-        return cls(recording, tuple(lines), taken)
+        return cls(recording, tuple(lines), friction.sizes(SEEN))
 
     @property
     def folds(self) -> tuple[tuple[Fold, float], ...]:
@@ -92,9 +91,8 @@ class WholeRecords:
         run_in
             Whether what comes before the whole periods is in.
         """
-        delays = found.delay_values
-        between = [self._spectrum(one, delays, run_in=False, beyond=True) for one in self.lines]
-        wide = [self._spectrum(one, delays, run_in=run_in, beyond=False) for one in self.lines]
+        between = [self._spectrum(one, found, run_in=False, beyond=True) for one in self.lines]
+        wide = [self._spectrum(one, found, run_in=run_in, beyond=False) for one in self.lines]
         rough = tuple(self._rough(*each, found) for each in zip(self.lines, between, strict=True))
         told = RecordData(self.recording.names, tuple(between), rough)
         seen = told.systems(found.model, found.delay_values)
@@ -110,7 +108,7 @@ class WholeRecords:
         return replace(data, spread=_spread(data.systems(found.model, found.delay_values), groups))
 
     def _spectrum(
-        self, one: LinePhasors, delays: FloatArray, *, run_in: bool, beyond: bool
+        self, one: LinePhasors, found: RefinedModel, *, run_in: bool, beyond: bool
     ) -> Spectrum:
         """Spectrum up to the highest line, or as far beyond it as the noise is wanted."""
         experiment, step = one.given.experiment, self.recording.sample_period
@@ -118,11 +116,20 @@ class WholeRecords:
         for fold, size in self.folds:
             torque[:, fold.axis] -= fold.course(self._reference(one, fold.axis), size)
         if np.any(self.friction):
-            signs = signs_of_velocity(experiment, step, float(one.frequencies[-1]), delays)
-            torque = torque - signs * self.friction
+            torque -= self._rubbing(one, found)
         M = len(self.recording.axes)
         signals, bins = self._cut(one, np.hstack([experiment.position, torque]), run_in, beyond)
         return spectrum_of(signals[:, :M], signals[:, M:], step, bins)
+
+    def _rubbing(self, one: LinePhasors, found: RefinedModel) -> FloatArray:
+        """Dry friction in every row, (n, M): of motors that stand, as in the last whole period."""
+        experiment, step = one.given.experiment, self.recording.sample_period
+        highest, delays = float(one.frequencies[-1]), found.delay_values
+        sliding = Sliding.of(settled(experiment, step), step, highest, delays)
+        standing = sliding.standing(found.model, delays, self.friction)
+        way = directions(experiment, step, highest, delays)
+        period = np.arange(-experiment.samples, 0) % standing.shape[0]
+        return way * self.friction + np.where(way == 0, standing[period], 0.0)
 
     @staticmethod
     def _reference(one: LinePhasors, axis: int) -> FloatArray:
