@@ -260,3 +260,29 @@ def test_moderate_dry_friction_leaves_masses_and_springs(make_bench, travel, fri
         for kind in ("masses", "springs"):
             values = [one["value"] for one in axis[kind]]
             assert values == pytest.approx(truth.get(kind, []), rel=2e-3)
+
+
+def test_friction_of_most_of_the_torque_is_told_from_masses_and_springs(make_bench, fresh_rng):
+    """It holds the motors at every turn; the prior model is that of the machine before new tooling."""
+    friction = float(fresh_rng.uniform(0.6, 0.9))
+    machine = turntable(friction)
+    for simulated in machine["simulation"]["axes"]:
+        for gain, factor in (("position_p", 2.0), ("velocity_p", 2.0), ("velocity_i", 4.0)):
+            simulated["gains"][gain] *= factor
+    bench = make_bench(machine)
+    outcome = fast(bench, "measure", "--time", 20)
+    assert outcome.code == 0, outcome.err
+    outcome = bench.command("identify", bench.out)
+    assert outcome.code == 0, outcome.err
+    model = yaml.safe_load((bench.out / "model.yaml").read_text(encoding="utf-8"))
+    for axis, truth in zip(model["axes"], machine["simulation"]["axes"], strict=True):
+        for kind in ("masses", "springs"):
+            for one, true in zip(axis[kind], truth[kind] if kind in truth else [], strict=True):
+                assert one["value"] == pytest.approx(true, abs=5 * one["std"] + 0.002 * true)
+                assert one["value"] == pytest.approx(true, rel=0.06)
+    rubs = {
+        e["axis"]: e["parameters"]["torque"]["value"]
+        for e in model["effects"]
+        if e["effect"] == "coulomb_friction"
+    }
+    assert rubs == pytest.approx({"table": friction, "arm": friction}, rel=0.05)

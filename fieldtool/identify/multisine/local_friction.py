@@ -12,8 +12,8 @@ all stretches; a stretch in which a resonance bends the line counts as little as
 Dry friction that is a large share of the torque hides modes, or makes others.  Taken off beforehand,
 it leaves data in which they can be counted; the fit of the machine then finds it again, better.
 Source: local polynomial method, Pintelon and Schoukens, System Identification, chapter 7, with one
-input more.  Valid for: two amplitudes of reversing motion or lines that were left out, as all our
-multisines have; friction at the motors.
+input more.  Valid for: multisines of which lines were left out, with excited lines in every
+stretch; friction at the motors.
 """
 
 from collections.abc import Sequence
@@ -36,6 +36,8 @@ STRETCH = 10
 """Lines of the period in which the machine's dynamic stiffness is taken for straight."""
 ROUNDS = 20
 """Of weighting stretches by what they leave."""
+LEAST_SHARE = 0.03
+"""Of the torque: what is bent within a stretch looks like friction of up to a fifth of that."""
 LEAST_LEFT = 0.1
 """Of the median: what a stretch leaves is taken for no less, so that no single one decides."""
 
@@ -66,12 +68,13 @@ def local_friction(
     sample_period
         s.
     band
-        Lowest and highest excited frequency, Hz.
+        Lowest and highest excited frequency, Hz: where nothing is excited, the loops alone tie torque
+        to motion, and friction can not be told.
 
     Returns
     -------
     DryFriction
-        With standard error infinite where the lines are too few.
+        None of an axis where it is less than ``LEAST_SHARE`` of the torque or the lines are too few.
     """
     still = np.zeros(len(axes))
     alike: dict[int, list[Experiment]] = {}
@@ -100,8 +103,12 @@ def local_friction(
                 sign = np.concatenate([one.sign[rows, axis] for one in group])
                 stretches.append(_less(np.vstack(known), torque, sign))
         found.append(_explaining([s for s in stretches if s.freedom > 0]))
-    shares = [abs(one.value) / max(np.sqrt(p), 1e-300) for one, p in zip(found, power, strict=True)]
-    return DryFriction(tuple(axes), tuple(found), np.array(shares))
+    shares = np.abs([one.value for one in found]) / np.maximum(np.sqrt(power), 1e-300)
+    worth = (
+        one if share > LEAST_SHARE else Estimate(0.0)
+        for one, share in zip(found, shares.tolist(), strict=True)
+    )
+    return DryFriction(tuple(axes), tuple(worth), shares)
 
 
 def without_local_friction(recording: Recording, sizes: FloatArray, highest: float) -> Recording:
