@@ -277,7 +277,7 @@ def test_friction_of_most_of_the_torque_is_told_from_masses_and_springs(make_ben
     model = yaml.safe_load((bench.out / "model.yaml").read_text(encoding="utf-8"))
     for axis, truth in zip(model["axes"], machine["simulation"]["axes"], strict=True):
         for kind in ("masses", "springs"):
-            for one, true in zip(axis[kind], truth[kind] if kind in truth else [], strict=True):
+            for one, true in zip(axis[kind], truth.get(kind, []), strict=True):
                 assert one["value"] == pytest.approx(true, abs=5 * one["std"] + 0.002 * true)
                 assert one["value"] == pytest.approx(true, rel=0.06)
     rubs = {
