@@ -27,6 +27,19 @@ def white_noise(values: FloatArray) -> FloatArray:
     return np.asarray(left / 0.6745 / np.sqrt(comb(16, 8)), dtype=np.float64)
 
 
+def position_noise(position: FloatArray) -> FloatArray:
+    """Standard error of each column's noise, (M,): white, an encoder's steps, or rounded numbers.
+
+    An axis that stands shows none of its noise, or a count now and then, which no median sees.  One
+    move may be less than a step of the encoder: where periods are joined.
+    """
+    moves = np.abs(np.diff(position, axis=0))
+    steps = np.sort(np.where(moves > 0, moves, np.inf), axis=0)[1]
+    counts = np.where(np.isfinite(steps), steps, 0.0) / 12**0.5
+    least: FloatArray = np.spacing(np.max(np.abs(position), axis=0))
+    return np.asarray(np.maximum.reduce([white_noise(position), counts, least]), dtype=np.float64)
+
+
 def velocity_noise(noise: FloatArray, band: FloatArray, step: float) -> FloatArray:
     """Standard error of velocities up to `band`, Hz, of positions with white `noise`, (M,)."""
     return np.asarray(2 * np.pi * band * noise * np.sqrt(2 * band * step / 3), dtype=np.float64)
@@ -46,13 +59,10 @@ def velocity_band(position: FloatArray, step: float, least: float) -> FloatArray
 
     Notes
     -----
-    The velocity's noise is then ``NOISY / UNSURE`` of the fastest velocity; that of an encoder is
-    no less than one of its steps makes, divided by sqrt(12).
+    The velocity's noise is then ``NOISY / UNSURE`` of the fastest velocity.
     """
-    moves = np.abs(np.diff(position, axis=0))
-    counts = np.min(moves, axis=0, where=moves > 0, initial=np.inf)
-    noise = np.maximum(white_noise(position), np.where(np.isfinite(counts), counts, 0.0) / 12**0.5)
-    fastest = np.quantile(moves, 0.99, axis=0) / step
+    noise = position_noise(position)
+    fastest = np.quantile(np.abs(np.diff(position, axis=0)), 0.99, axis=0) / step
     allowed = NOISY / UNSURE * fastest
     unit = np.maximum(velocity_noise(noise, np.ones_like(noise), step), 1e-300)
     band = np.minimum((allowed / unit) ** (2 / 3), HIGHEST / (2 * step))

@@ -1,13 +1,17 @@
 """Dry friction beside a linear model: found with the size it was simulated with, or not at all."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numba import njit
 
 from fieldtool.frf.phasors import Phasors
+from fieldtool.frf.velocity_band import position_noise
 from fieldtool.identify.multisine.dry_friction import dry_friction, without_dry_friction
 from fieldtool.identify.multisine.local_friction import local_friction
-from fieldtool.identify.multisine.sliding import Sliding
+from fieldtool.identify.multisine.records import settled
+from fieldtool.identify.multisine.sliding import Sliding, directions
 from fieldtool.records.model import AxisModel, Estimate, MachineModel
 from fieldtool.records.recording import Experiment
 
@@ -143,3 +147,36 @@ def test_a_constant_velocity_keeps_friction_out(fresh_rng: np.random.Generator) 
     )  # fmt: skip
     found = dry_friction([moved], STEP, (3.0, 13.0), rigid(), np.zeros(1))
     assert found.torque[0].value == pytest.approx(0.0, abs=1e-6)
+
+
+@pytest.mark.parametrize("shown", ["nothing", "a count now and then", "rounded numbers"])
+def test_a_motor_that_stands_throughout_turns_in_no_direction(
+    shown: str, fresh_rng: np.random.Generator
+) -> None:
+    count, n = 1e-4, SAMPLES * PERIODS
+    place = count * float(fresh_rng.integers(1000, 5000))
+    if shown == "a count now and then":
+        jitter = count * (fresh_rng.random((n, 1)) < 0.02)
+    elif shown == "rounded numbers":
+        jitter = np.spacing(place) * fresh_rng.integers(-1, 2, (n, 1))
+    else:
+        jitter = np.zeros((n, 1))
+    one = Experiment(
+        "stand", "multisine", ("a",), (), SAMPLES * STEP, np.arange(n) * STEP,
+        place + jitter, fresh_rng.normal(0, 0.01, (n, 1)),
+    )  # fmt: skip
+    for taken in (one, settled(one, STEP)):
+        sliding_one = Sliding.of(taken, STEP, 13.0, np.zeros(1))
+        assert np.mean(sliding_one.direction != 0) < 0.02
+        assert np.mean(directions(taken, STEP, 13.0, np.zeros(1)) != 0) < 0.02
+
+
+def test_an_encoder_is_as_coarse_after_its_periods_were_joined(
+    fresh_rng: np.random.Generator,
+) -> None:
+    one = sliding(0.5, fresh_rng)
+    count = float(np.ptp(one.position)) / 200
+    coarse = replace(one, position=count * np.round(one.position / count))
+    joined = settled(coarse, STEP)
+    for taken in (coarse, joined):
+        assert position_noise(taken.position)[0] >= 0.99 * count / 12**0.5

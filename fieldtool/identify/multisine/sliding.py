@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from fieldtool.frf.velocity_band import (
     STOPPED,
     UNSURE,
+    position_noise,
     velocity_band,
     velocity_noise,
-    white_noise,
 )
 from fieldtool.identify.likelihood.refine import machine_response
 from fieldtool.records.model import MachineModel
@@ -39,7 +39,7 @@ class Sliding:
     highest: float
     """Highest excited frequency, Hz."""
     position: FloatArray
-    """rad or m, a straight drift over the period taken off."""
+    """rad or m from where the experiment begins, a straight drift over the period taken off."""
     torque: FloatArray
     """N m or N."""
     direction: FloatArray
@@ -62,7 +62,7 @@ class Sliding:
             itself.  Shape (M,), s.
         """
         samples = round(float(experiment.period or 0.0) / step)
-        position, drift = _mean(experiment.position, samples)
+        position, drift = _mean(experiment.position - experiment.position[0], samples)
         velocity = _velocity(position, experiment, step, highest, delays) + drift / step
         direction = _direction(velocity, experiment, step, highest)
         return cls(step, highest, position, _mean(experiment.torque, samples)[0], direction)
@@ -140,7 +140,7 @@ def _direction(
     velocity: FloatArray, experiment: Experiment, step: float, highest: float
 ) -> FloatArray:
     band = velocity_band(experiment.position, step, HARMONICS * highest)
-    noise = velocity_noise(white_noise(experiment.position), band, step)
+    noise = velocity_noise(position_noise(experiment.position), band, step)
     fastest = np.quantile(np.abs(velocity), 0.99, axis=0)
     still = np.abs(velocity) < np.maximum(UNSURE * noise, STOPPED * fastest)
     return np.where(still, 0.0, np.sign(velocity))
