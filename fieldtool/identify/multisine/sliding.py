@@ -75,9 +75,10 @@ class Sliding:
         return lines
 
     def lines(self, values: FloatArray) -> ComplexArray:
-        """Return peak phasors of a course at these lines, (K, M)."""
+        """Return peak phasors of a course at these lines, (K, M): none of a constant."""
         count = values.shape[0]
-        out: ComplexArray = np.fft.rfft(values, axis=0)[1 : count // 2] * (2 / count)
+        spectrum = np.fft.rfft(values - values.mean(axis=0), axis=0)
+        out: ComplexArray = spectrum[1 : count // 2] * (2 / count)
         return out
 
     def standing(self, model: MachineModel, delays: FloatArray, sizes: FloatArray) -> FloatArray:

@@ -195,9 +195,8 @@ class WholeRecords:
                 first = self.lines[group[0]]
                 ratio = power[k] / power[group[0]]
                 alike = (ratio < SAME_NOISE) & (ratio > 1 / SAME_NOISE)
-                design = (one.given.samples, one.given.periods)
                 if (
-                    design == (first.given.samples, first.given.periods)
+                    _design(one) == _design(first)
                     and same_level(one.level, first.level)
                     and np.all(alike)
                 ):
@@ -269,6 +268,11 @@ class _Noise:
         back = np.linalg.inv(whitening(rough)) * np.sqrt(2.0)
         covariance: ComplexArray = back @ mean @ back.conj().transpose(0, 2, 1)
         return (covariance + covariance.conj().transpose(0, 2, 1)) / 2
+
+
+def _design(one: LinePhasors) -> tuple[int, int, int]:
+    """Samples of a period, periods, and the highest line: what makes bins the same ones."""
+    return one.given.samples, one.given.periods, int(one.given.lines[-1])
 
 
 def _white_shapes(found: RefinedModel, omega: FloatArray) -> ComplexArray:
