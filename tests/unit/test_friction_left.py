@@ -81,14 +81,14 @@ def test_friction_is_found_of_a_position_that_is_told_late(
 def test_friction_is_found_without_a_model(fresh_rng: np.random.Generator) -> None:
     friction = float(fresh_rng.uniform(0.3, 2.0))
     experiments = [sliding(friction, fresh_rng) for _ in range(3)]
-    found = local_friction(("a",), experiments, STEP, (3.0, 13.0))
+    found, _ = local_friction(("a",), experiments, STEP, (3.0, 13.0))
     assert found.torque[0].value == pytest.approx(friction, rel=0.25)  # one in ten is 5 % off
     assert found.seen(5.0) == (0,)
 
 
 def test_without_friction_none_is_found_without_a_model(fresh_rng: np.random.Generator) -> None:
     experiments = [sliding(0.0, fresh_rng) for _ in range(3)]
-    found = local_friction(("a",), experiments, STEP, (3.0, 13.0))
+    found, _ = local_friction(("a",), experiments, STEP, (3.0, 13.0))
     assert found.seen(5.0) == ()
     assert found.share[0] < 0.02
 

@@ -83,3 +83,12 @@ def test_experiments_of_different_bands(fresh_rng: np.random.Generator) -> None:
 def test_friction_that_never_turns_is_none(fresh_rng: np.random.Generator) -> None:
     found = identified(experiment(fresh_rng, 1, friction=0.5, speed=20.0))
     check(found, 0.0)
+
+
+@pytest.mark.parametrize("late", [1.5, 4.0])
+def test_friction_beside_positions_that_are_told_late(
+    late: float, fresh_rng: np.random.Generator
+) -> None:
+    found = identified(experiment(fresh_rng, 1, friction=0.5, late=late * STEP))
+    check(found, 0.5)
+    assert found.fitted.delays[0].value == pytest.approx(late * STEP, rel=0.01)

@@ -182,10 +182,11 @@ def _freed_response(
     lines = lines_of(recording, complete)
     excited = np.concatenate([one.phasors(names).frequencies for one in lines])
     band = (float(excited.min()), float(excited.max()))
-    early = local_friction(names, [settled(one, step) for one in experiments], step, band)
+    ones = [settled(one, step) for one in experiments]
+    early, delays = local_friction(names, ones, step, band)
     if not early.seen(SEEN):
         return early, joint_response(recording, complete)
-    freed = without_local_friction(recording, early.sizes(SEEN), band[1])
+    freed = without_local_friction(recording, early.sizes(SEEN), band[1], delays)
     straight = {one.name: one for one in freed.experiments}
     measured = joint_response(freed, tuple(straight[one.name] for one in complete))
     bent = joint_distortion(lines, measured.response)
