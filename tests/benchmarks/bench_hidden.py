@@ -41,6 +41,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 from fieldtool.criticise.criticise import criticise
 from fieldtool.criticise.effects import candidates
 from fieldtool.criticise.search.fit import fit
+from fieldtool.criticise.search.instants import timed as timed_best
 from fieldtool.criticise.search.screen import screened, tangent
 from fieldtool.criticise.where.sentences import relative_error
 from tests.hidden.hiding import MAKERS, draw
@@ -73,6 +74,8 @@ def told(criticised, hidden):
         grown = start.with_effect(one.effect)
         grown = replace(grown, values=(*grown.values[:-1], one.start))
         fitted = fit(simulator, grown, steps=20)
+        if hidden.effect == "stiffness_change":
+            fitted = timed_best(simulator, fitted, len(fitted.hypothesis.effects) - 1)
         if best is None or fitted.cost < best.cost:
             best = fitted
     if best is None:
