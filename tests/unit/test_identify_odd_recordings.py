@@ -6,6 +6,8 @@ Two masses on a spring each, in steady state, from the equations of motion in ea
 import numpy as np
 import pytest
 
+from fieldtool.errors import IdentificationError
+from fieldtool.identify.multisine import identify
 from fieldtool.identify.multisine.identify import JointIdentified, identify_joint
 from fieldtool.records.recording import AxisInfo, Experiment, Recording
 
@@ -92,3 +94,17 @@ def test_friction_beside_positions_that_are_told_late(
     found = identified(experiment(fresh_rng, 1, friction=0.5, late=late * STEP))
     check(found, 0.5)
     assert found.fitted.delays[0].value == pytest.approx(late * STEP, rel=0.01)
+
+
+def test_a_fit_that_runs_away_is_said_in_a_sentence(
+    fresh_rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As of data of so little noise that what friction leaves is all that is fitted."""
+
+    def singular(*_: object) -> None:
+        np.linalg.inv(np.zeros((2, 2)))
+
+    monkeypatch.setattr(identify, "with_free_motion", singular)
+    with pytest.raises(IdentificationError, match="runs away") as told:
+        identified(experiment(fresh_rng, 1, friction=0.5))
+    assert "strongly non-linear" in told.value.__notes__[0]

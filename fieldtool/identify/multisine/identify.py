@@ -147,9 +147,19 @@ def identify_joint(
 
 @contextmanager
 def _told_of_distortion(measured: JointResult) -> Iterator[None]:
-    """Add to an error that the data are not those of a straight machine, where they show it."""
+    """Add to an error that the data are not those of a straight machine, where they show it.
+
+    A fit that runs away to numbers that are no machine's is an error of that kind.
+    """
     try:
-        yield
+        try:
+            yield
+        except np.linalg.LinAlgError as error:
+            raise IdentificationError(
+                "the fit runs away to masses and springs that are no machine's; another number of "
+                "masses (--masses AXIS=N)? Look at the responses in frequency-response.h5, or use the "
+                "classic plan."
+            ) from error
     except IdentificationError as error:
         seen = [
             f"{one.axis} ({20 * np.log10(max(one.odd_share, one.even_share)):.0f} dB of its torque)"
