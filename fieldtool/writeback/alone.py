@@ -33,7 +33,11 @@ def alone_on(bus: BusProfile) -> Iterator[None]:
         yield
         return
     name = " ".join(str(part) for part in (bus.interface, bus.channel) if part is not None)
-    what = [name, *(f"{key} {value}" for key, value in sorted(bus.options.items()))]
+    what = [name]
+    if (
+        bus.interface != "socketcan"
+    ):  # there the channel is the hardware; elsewhere an option may be
+        what += [f"{key} {value}" for key, value in sorted(bus.options.items())]
     folder = state_folder("buses")
     lock = FileLock(folder / f"{re.sub(r'[^A-Za-z0-9_.-]', '_', ' '.join(what))[:100]}.lock")
     try:
