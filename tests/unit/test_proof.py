@@ -24,7 +24,7 @@ AXES = Axes(
     np.full(2, COUNT),
     np.full(2, INERTIA),
     np.full(2, 30.0),
-    (True, True),
+    torque_offsets=(True, True),
 )
 
 
