@@ -16,6 +16,9 @@ FEWEST_WAVES = 1.5
 FEW_WAVES = (0.5, 0.75, 1.0)
 """Waves within the travel that are tried besides, where gravity could be meant as well."""
 MOST_ORDERS = 4000
+WAVING, STEEPEST = 0.05, 0.5
+"""Largest error of an encoder over the travel, and its slope: with 1 and more, a position would be told
+twice."""
 BINS = 8
 """Bins of the position per wave of the highest order."""
 
@@ -123,7 +126,7 @@ def position_candidates(context: Context) -> list[Effect]:
         per = "rad/m" if info.kind == "linear" else "1/turn"
         for kind, length, most in (
             (Cogging, unit, 5 * size),
-            (EncoderError, info.position_unit, 0.02 * travel),
+            (EncoderError, info.position_unit, WAVING * travel),
         ):
             orders = waves(context, axis, kind is EncoderError)
             if info.kind == "rotary" and travel > 0.0:
@@ -132,7 +135,8 @@ def position_candidates(context: Context) -> list[Effect]:
                 low, high = (0.8, 1.25) if order * travel > 2 * np.pi * FEWEST_WAVES else (0.6, 1.6)
                 low, high = low * order, high * order
                 number = Parameter("order", per, order, low, high, 0.1 * 2 * np.pi / travel)
-                pair = (wave("sine", most, length), wave("cosine", most, length))
+                reach = min(most, STEEPEST / order) if kind is EncoderError else most
+                pair = (wave("sine", reach, length), wave("cosine", reach, length))
                 out.append(kind(axis, (*pair, number)))
     return out
 

@@ -5,8 +5,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from fieldtool.criticise.evidence.spans import Role
 from fieldtool.criticise.search.fit import Fitted, fit
 from fieldtool.criticise.search.hypothesis import Hypothesis, Simulator
+from fieldtool.criticise.simulate.motion import Motion
 
 FloatArray = NDArray[np.float64]
 PARTS = 20
@@ -15,8 +17,20 @@ AGAIN = 3
 """Times at most that the rest is fitted beside a better instant."""
 
 
+def instants(simulator: Simulator) -> list[float]:
+    """Return instants, s, of which no two are alike to the rows of role ``fit``.
+
+    Three within each experiment that is seen, and one in each gap between two of them.
+    """
+    seen = _seen(simulator)
+    within = [m.clock[0] + s * (m.clock[-1] - m.clock[0]) for m in seen for s in (0.25, 0.5, 0.75)]
+    return sorted(float(t) for t in [*within, *(m.clock[0] for m in seen[1:])])
+
+
 def timed(simulator: Simulator, fitted: Fitted, place: int) -> Fitted:
     """Return a fit with the instant of one effect at which least is left, where that is another.
+
+    An instant that lies between what was seen is no matter to a fit: it is where unseen data have it.
 
     Parameters
     ----------
@@ -25,40 +39,66 @@ def timed(simulator: Simulator, fitted: Fitted, place: int) -> Fitted:
     place : int
         Of an effect with a number named ``time``, s.
     """
-    seen = {lines.span.experiment for lines in simulator.lines if lines.span.role == "fit"}
+    seen = _seen(simulator)
     for _ in range(AGAIN):
         if not np.isfinite(fitted.cost):
-            break
+            return fitted
         now = fitted.hypothesis.values[place]["time"]
-        around = [
-            m
-            for name, m in simulator.motions.items()
-            if name in seen and m.clock[0] <= now <= m.clock[-1]
-        ]
+        around = [m for m in seen if m.clock[0] <= now <= m.clock[-1]]
         if not around:
             break
-        best = (fitted.cost, now)
-        step = (around[0].clock[-1] - around[0].clock[0]) / PARTS
-        coarse = [m.clock[0] + step * np.arange(PARTS) for m in around]
-        best = min(best, _least(simulator, fitted, place, np.concatenate(coarse)))
-        # What a changed spring rings with has a minimum every half cycle.
-        fine = best[1] + step * np.linspace(-1.0, 1.0, 2 * PARTS + 1)
-        best = min(best, _least(simulator, fitted, place, fine))
+        best = _best(simulator, fitted, place, around, "fit")
         if not best[0] < fitted.cost:
             break
         better = fit(simulator, _moved(fitted.hypothesis, place, best[1]))
         if not better.cost < fitted.cost:
             break
         fitted = better
-    return fitted
+    now = fitted.hypothesis.values[place]["time"]
+    compared = [
+        (m.clock[lines.span.start], m.clock[lines.span.stop - 1])
+        for lines in simulator.lines
+        if lines.span.role == "fit"
+        for m in [simulator.motions[lines.span.experiment]]
+    ]
+    if any(start < now <= stop for start, stop in compared):
+        return fitted
+    first = max((stop for _, stop in compared if stop < now), default=-np.inf)
+    last = min((start for start, _ in compared if start >= now), default=np.inf)
+    between = [m for m in simulator.motions.values() if first < m.clock[0] and m.clock[-1] < last]
+    if not between:
+        return fitted
+    _, now = _best(simulator, fitted, place, between, "unseen")
+    return replace(fitted, hypothesis=_moved(fitted.hypothesis, place, now))
+
+
+def _seen(simulator: Simulator) -> list[Motion]:
+    """Return the motions of which any rows are of role ``fit``, as time goes."""
+    names = {lines.span.experiment for lines in simulator.lines if lines.span.role == "fit"}
+    return sorted(
+        (m for name, m in simulator.motions.items() if name in names), key=lambda m: m.clock[0]
+    )
+
+
+def _best(
+    simulator: Simulator, fitted: Fitted, place: int, around: list[Motion], role: Role
+) -> tuple[float, float]:
+    """Return the least cost and its instant, of all in some motions and now."""
+    now = fitted.hypothesis.values[place]["time"]
+    step = (around[0].clock[-1] - around[0].clock[0]) / PARTS
+    coarse = [m.clock[0] + step * np.arange(PARTS) for m in around]
+    best = _least(simulator, fitted, place, np.concatenate([[now], *coarse]), role)
+    # What a changed spring rings with has a minimum every half cycle.
+    fine = best[1] + step * np.linspace(-1.0, 1.0, 2 * PARTS + 1)
+    return min(best, _least(simulator, fitted, place, fine, role))
 
 
 def _least(
-    simulator: Simulator, fitted: Fitted, place: int, times: FloatArray
+    simulator: Simulator, fitted: Fitted, place: int, times: FloatArray, role: Role
 ) -> tuple[float, float]:
     """Return the least cost and its instant, all other numbers as they are."""
     tried = [(float(t), _moved(fitted.hypothesis, place, float(t))) for t in times]
-    return min((float(np.sum(simulator.residual(h, "fit") ** 2)), t) for t, h in tried)
+    return min((float(np.sum(simulator.residual(h, role) ** 2)), t) for t, h in tried)
 
 
 def _moved(hypothesis: Hypothesis, place: int, time: float) -> Hypothesis:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from fieldtool.criticise.effects.base import Effect
 from fieldtool.criticise.search.fit import machine_derivatives
 from fieldtool.criticise.search.hypothesis import Hypothesis, Simulator
+from fieldtool.criticise.search.instants import instants
 from fieldtool.criticise.search.modes import best_mode
 
 FloatArray = NDArray[np.float64]
@@ -18,6 +19,15 @@ SOONER = (1 / 8, 1 / 16, 1 / 32)
 """Of an experiment: how far from where it was tried a change may be."""
 WORTH = 0.003
 """Share of the error that a change explains, from which its time is looked for."""
+FAR = (-0.2, -0.1, -0.05, -0.02, 0.02, 0.05, 0.1, 0.25)
+"""Changes of a spring that are simulated: a resonance that moves by more than it is wide is not in any
+derivative."""
+FAR_BENT = (1e-4, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2, 0.1)
+"""The same of springs that harden or soften, over the most."""
+EXPLAINED = 0.5
+"""Share of the error that the best candidate is expected to explain, from which they are not."""
+STEP = 0.01
+"""Of a derivative, over the size of the number."""
 SMALLEST_PART = 0.02
 """Of a start value, that is left of it at least."""
 
@@ -78,8 +88,13 @@ def screened(
         one = _screen(simulator, at, effect)
         if one is not None and (effect.key not in best or one.gain > best[effect.key].gain):
             best[effect.key] = one
-    for one in [b for b in best.values() if b.effect.name == "stiffness_change"]:
-        best[one.effect.key] = _in_time(simulator, at, one)
+    for key, one in best.items():
+        if one.effect.name == "stiffness_change":
+            best[key] = _in_time(simulator, at, one)
+    cost = float(at.side @ at.side)
+    if all(b.gain < EXPLAINED * cost for b in best.values()):
+        for key, one in best.items():
+            best[key] = _far(simulator, at, one)
     return sorted(best.values(), key=lambda s: -s.gain)
 
 
@@ -101,6 +116,24 @@ def _in_time(simulator: Simulator, at: Tangent, one: Screened) -> Screened:
     return one
 
 
+def _far(simulator: Simulator, at: Tangent, one: Screened) -> Screened:
+    """Return a start from a larger change of a spring, simulated, where more is gained."""
+    starts: list[dict[str, float]] = []
+    if one.effect.name == "stiffness_change":
+        starts = [{"change": c, "time": t} for t in instants(simulator) for c in FAR]
+    elif one.effect.name in ("hardening_spring", "softening_spring"):
+        cubic = one.effect.parameters[0]
+        starts = [{cubic.name: share * (cubic.low + cubic.high)} for share in FAR_BENT]
+    grown = at.hypothesis.with_effect(one.effect)
+    cost = float(at.side @ at.side)
+    for start in starts:
+        r = simulator.residual(replace(grown, values=(*grown.values[:-1], start)), "fit")
+        gain = cost - float(r @ r)
+        if gain > one.gain:  # what is not finite is not larger
+            one = replace(one, start=start, gain=gain)
+    return one
+
+
 def _screen(simulator: Simulator, at: Tangent, effect: Effect) -> Screened | None:
     grown = at.hypothesis.with_effect(effect)
     place = len(grown.effects) - 1
@@ -117,9 +150,11 @@ def _screen(simulator: Simulator, at: Tangent, effect: Effect) -> Screened | Non
     columns, low, high = [], [], []
     for p in linear:
         values = [dict(v) for v in grown.values]
-        values[place][p.name] = p.scale
+        # A spring that softens is no spring on the other side of 0.
+        step = STEP * (p.scale if p.clipped(p.scale) > 0.0 else -p.scale)
+        values[place][p.name] = step
         moved = Hypothesis(grown.machine, grown.base, grown.effects, tuple(values))
-        columns.append((simulator.residual(moved, "fit") - r) / p.scale)
+        columns.append((simulator.residual(moved, "fit") - r) / step)
         low.append(p.low)
         high.append(p.high)
     if not linear:
@@ -156,17 +191,19 @@ def _solved(
     side -= at.basis @ (at.basis.T @ side)
     size = np.linalg.norm(rows, axis=0)
     active = size > 1e-9 * max(float(np.linalg.norm(columns)), 1e-300)
+    if not active.any():
+        return None
     values = np.zeros(columns.shape[1])
-    for _ in range(columns.shape[1]):
-        if not active.any():
-            return None
+    while active.any():
         solved = -np.linalg.lstsq(rows[:, active] / size[active], side, rcond=1e-10)[0]
         values[:] = 0.0
         values[active] = solved / size[active]
-        outside = (values < low) | (values > high)
+        outside = active & ((values < low) | (values > high))
         if not outside.any():
             break
         active &= ~outside
+    if not active.any():
+        return Screened(effect, dict(start), 0.0)
     values = np.clip(values, low, high)
     left = side + rows @ values
     # The gain is counted from what was there, with what the effect replaces still in place.

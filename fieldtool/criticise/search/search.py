@@ -54,7 +54,7 @@ SETTLED = 1e-3
 """Change of a number of the machine over its size, from which fit and noise are found anew."""
 CLEAR = 0.9
 """Share of what is not explained, from which no other start is tried."""
-ELSEWHERE, ELSEWHERE_LOOSE = 0.01, 0.3
+ELSEWHERE, ELSEWHERE_LOOSE = 0.003, 0.3
 """Relative change of a mass, spring or coupling, and of a damper or friction, that bends a fit."""
 TRACE, TRACE_MORE = 0.01, 0.04
 """Share of the error that a candidate must be expected to explain to be fitted in full: the first of an
