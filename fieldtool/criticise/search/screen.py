@@ -26,8 +26,6 @@ FAR_BENT = (1e-4, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2, 0.1)
 """The same of springs that harden or soften, over the most."""
 EXPLAINED = 0.5
 """Share of the error that the best candidate is expected to explain, from which they are not."""
-STEP = 0.01
-"""Of a derivative, over the size of the number."""
 SMALLEST_PART = 0.02
 """Of a start value, that is left of it at least."""
 
@@ -151,7 +149,7 @@ def _screen(simulator: Simulator, at: Tangent, effect: Effect) -> Screened | Non
     for p in linear:
         values = [dict(v) for v in grown.values]
         # A spring that softens is no spring on the other side of 0.
-        step = STEP * (p.scale if p.clipped(p.scale) > 0.0 else -p.scale)
+        step = p.scale if p.clipped(p.scale) > 0.0 else -p.scale
         values[place][p.name] = step
         moved = Hypothesis(grown.machine, grown.base, grown.effects, tuple(values))
         columns.append((simulator.residual(moved, "fit") - r) / step)
