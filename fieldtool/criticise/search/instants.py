@@ -1,5 +1,6 @@
 """When something changed: the time of a step is no number that derivatives lead to, so it is tried."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -30,7 +31,7 @@ def instants(simulator: Simulator) -> list[float]:
 def timed(simulator: Simulator, fitted: Fitted, place: int) -> Fitted:
     """Return a fit with the instant of one effect at which least is left, where that is another.
 
-    An instant that lies between what was seen is no matter to a fit: it is where unseen data have it.
+    An instant that lies between what was seen is no matter to a fit: it is where all data have it.
 
     Parameters
     ----------
@@ -47,7 +48,7 @@ def timed(simulator: Simulator, fitted: Fitted, place: int) -> Fitted:
         around = [m for m in seen if m.clock[0] <= now <= m.clock[-1]]
         if not around:
             break
-        best = _best(simulator, fitted, place, around, "fit")
+        best = _best(simulator, fitted, place, around, ("fit",))
         if not best[0] < fitted.cost:
             break
         better = fit(simulator, _moved(fitted.hypothesis, place, best[1]))
@@ -61,14 +62,16 @@ def timed(simulator: Simulator, fitted: Fitted, place: int) -> Fitted:
         if lines.span.role == "fit"
         for m in [simulator.motions[lines.span.experiment]]
     ]
-    if any(start < now <= stop for start, stop in compared):
+    # A change at the very end or beginning of what is seen is as one beyond it.
+    edge = max((m.clock[-1] - m.clock[0] for m in seen), default=0.0) / PARTS
+    first = max((stop for _, stop in compared if stop - edge <= now), default=-np.inf)
+    last = min((start for start, _ in compared if start + edge >= now), default=np.inf)
+    if any(first < start and stop < last for start, stop in compared):
         return fitted
-    first = max((stop for _, stop in compared if stop < now), default=-np.inf)
-    last = min((start for start, _ in compared if start >= now), default=np.inf)
     between = [m for m in simulator.motions.values() if first < m.clock[0] and m.clock[-1] < last]
     if not between:
         return fitted
-    _, now = _best(simulator, fitted, place, between, "unseen")
+    _, now = _best(simulator, fitted, place, between, ("fit", "unseen"))
     return replace(fitted, hypothesis=_moved(fitted.hypothesis, place, now))
 
 
@@ -81,24 +84,27 @@ def _seen(simulator: Simulator) -> list[Motion]:
 
 
 def _best(
-    simulator: Simulator, fitted: Fitted, place: int, around: list[Motion], role: Role
+    simulator: Simulator, fitted: Fitted, place: int, around: list[Motion], roles: Sequence[Role]
 ) -> tuple[float, float]:
     """Return the least cost and its instant, of all in some motions and now."""
     now = fitted.hypothesis.values[place]["time"]
     step = (around[0].clock[-1] - around[0].clock[0]) / PARTS
     coarse = [m.clock[0] + step * np.arange(PARTS) for m in around]
-    best = _least(simulator, fitted, place, np.concatenate([[now], *coarse]), role)
+    best = _least(simulator, fitted, place, np.concatenate([[now], *coarse]), roles)
     # What a changed spring rings with has a minimum every half cycle.
     fine = best[1] + step * np.linspace(-1.0, 1.0, 2 * PARTS + 1)
-    return min(best, _least(simulator, fitted, place, fine, role))
+    return min(best, _least(simulator, fitted, place, fine, roles))
 
 
 def _least(
-    simulator: Simulator, fitted: Fitted, place: int, times: FloatArray, role: Role
+    simulator: Simulator, fitted: Fitted, place: int, times: FloatArray, roles: Sequence[Role]
 ) -> tuple[float, float]:
     """Return the least cost and its instant, all other numbers as they are."""
     tried = [(float(t), _moved(fitted.hypothesis, place, float(t))) for t in times]
-    return min((float(np.sum(simulator.residual(h, role) ** 2)), t) for t, h in tried)
+    return min(
+        (sum(float(np.sum(simulator.residual(h, role) ** 2)) for role in roles), t)
+        for t, h in tried
+    )
 
 
 def _moved(hypothesis: Hypothesis, place: int, time: float) -> Hypothesis:
