@@ -3,18 +3,22 @@
 from math import isnan
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from fieldtool.cli.main import main
 from fieldtool.errors import FileFormatError, OutputError
 from fieldtool.records.model import AxisModel, Coupling, Estimate, MachineModel
 from fieldtool.records.model_file import read_model, write_model
+from fieldtool.records.recording import save
+from tests.unit.late_axis import recorded
 
 MODEL = MachineModel(
     axes=(
         AxisModel(
             "x",
             "rotary",
-            (Estimate(1 / 3, 1e-5), Estimate(2.5e-7)),
+            (Estimate(2.5e-7, 1e-5), Estimate(1 / 3)),
             (Estimate(1234.5678901234567, 1.0),),
             (Estimate(1e-3, 1e-20),),
             Estimate(0.02, 0.001),
@@ -88,6 +92,71 @@ def test_a_faulty_model_is_refused_with_the_line(
     path.write_text(text.replace(old, new))
     with pytest.raises(FileFormatError, match=words):
         read_model(path)
+
+
+@pytest.mark.parametrize(
+    ("axis", "line", "words"),
+    [
+        (
+            "kind: rotary\n  masses: [1.0, -2.0]\n  springs: [5.0]",
+            5,
+            "mass 2 .* is -2 kg m2, .*above 0",
+        ),
+        ("kind: linear\n  masses: [0, 2.0]\n  springs: [5.0]", 5, "mass 1 .* is 0 kg, .*above 0"),
+        (
+            "kind: rotary\n  masses: [1, 2]\n  springs: [-5]",
+            6,
+            "spring 1 .* is -5 N m/rad, .*above 0",
+        ),
+        ("kind: linear\n  masses: [1, 2]\n  springs: [0.0]", 6, "spring 1 .* is 0 N/m, .*above 0"),
+        (
+            "kind: rotary\n  masses: [1, 2]\n  springs: [5]\n  dampers: [{value: -0.1}]",
+            7,
+            "damper 1 .* is -0.1 N m s/rad, .*at least 0",
+        ),
+    ],
+)
+def test_what_no_machine_can_have_is_refused_with_line_axis_and_unit(
+    tmp_path: Path, axis: str, line: int, words: str
+) -> None:
+    path = tmp_path / "model.yaml"
+    path.write_text(f"format: fieldtool-model/1\naxes:\n- name: x\n  {axis}\n")
+    with pytest.raises(FileFormatError, match=rf"model\.yaml:{line}: axis 'x': {words}.*identify"):
+        read_model(path)
+
+
+@pytest.mark.parametrize(
+    ("value", "sound"), [(1.4, True), (-1.4, True), (1.42, False), (-3, False)]
+)
+def test_couplings_beyond_their_masses_are_refused(
+    tmp_path: Path, value: float, sound: bool
+) -> None:
+    path = tmp_path / "model.yaml"
+    path.write_text(
+        "format: fieldtool-model/1\n"
+        "axes: [{name: x, kind: rotary, masses: [1]}, {name: y, kind: linear, masses: [2]}]\n"
+        f"couplings:\n- axes: [x, y]\n  value: {value}\n"
+    )
+    if sound:
+        assert read_model(path).couplings[0].value == value
+        return
+    with pytest.raises(FileFormatError, match=r"yaml:5: .*axes x and y, -?[\d.]+ kg m, .*correct"):
+        read_model(path)
+
+
+def test_a_spring_that_can_not_be_ends_the_command_with_code_2(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_model(MODEL, tmp_path / "model.yaml")
+    text = (tmp_path / "model.yaml").read_text()
+    (tmp_path / "model.yaml").write_text(text.replace("1234.56789", "-1234.56789"))
+    save(recorded(np.random.default_rng(1), 0.0), tmp_path / "recording.h5")
+    with pytest.raises(SystemExit) as ended:
+        main(["criticise", str(tmp_path / "recording.h5"), "--model", str(tmp_path / "model.yaml")])
+    said = capsys.readouterr().err
+    assert ended.value.code == 2
+    assert "spring 1 (motor side first) is -1234.57 N m/rad" in said
+    assert "Traceback" not in said
 
 
 def test_a_coupling_to_nowhere_is_refused(tmp_path: Path) -> None:
