@@ -235,6 +235,29 @@ def test_the_noise_of_the_first_torque_is_no_wrong_gain():
     assert not said
 
 
+def test_positions_that_are_told_a_cycle_late_are_no_wrong_gain():
+    """Old, slow gains hardly show it; new ones, of another size, do."""
+    noise = 0.02
+    old = replace(GOOD, position_p=6.0, velocity_p=15.0 * INERTIA, velocity_i=60.0 * INERTIA)
+    fine = COUNT / 16
+    target, _ = trial_path(GOOD, fine)
+    learning = IdentityWatch(
+        [drive(old, noise=drive(old).noise / 16)], STEP, np.array([0.01]), None, ["N m"]
+    )
+    learning.stand(still=False)
+    position, torque = Axis(old).run(np.tile(target, 20), noise, 3, fine)
+    first_alarm(learning, np.roll(position, 1), torque, np.tile(target, 20))
+    one = IdentityWatch(
+        [drive(GOOD, noise=drive(GOOD).noise / 16)],
+        STEP,
+        np.array([0.01]),
+        learning.learned(),
+        ["N m"],
+    )
+    position, torque = Axis(GOOD).run(target, noise, 4, fine)
+    assert first_alarm(one, np.roll(position, 1), torque, target) is None
+
+
 def test_what_comes_again_and_again_for_a_sample_is_seen_and_a_single_one_is_not():
     """Gains a hundred times too high answer each count of the encoder for a sample or two."""
     still, told = np.zeros(400), np.zeros(400)

@@ -2,13 +2,17 @@
 
 The torque that a controller should give is a sum of parts: what its position gain makes of the distance
 from the reference, what its velocity gain makes of the velocity's error, and what is fed forward.  The
-difference of told and expected torque is explained by shares of these parts, by being late, and by the
-noise of the one torque from which slow ones are left out, which fades as they do::
+difference of told and expected torque is explained by shares of these parts, by torques and by
+positions that are told late, and by the noise of the one torque from which slow ones are left out, which
+fades as they do::
 
-    told - expected = a position + b velocity + c fed forward + t d(expected)/dt + s fading + noise
+    told - expected = a position + b velocity + c fed forward
+                      + t d(expected)/dt + u d(what positions make)/dt + s fading + noise
 
-by least squares over the last cycles (forgotten exponentially), with prior knowledge of c, t and s
-(Gaussian: Bishop 2006, equations 3.53 and 3.54).  1 + a and 1 + b are the factors.  Both at once, a = b,
+by least squares over the last cycles (forgotten exponentially), with prior knowledge of c, t, u and s
+(Gaussian: Bishop 2006, equations 3.53 and 3.54).  A position that is told late has its own column: what
+reference and position make nearly cancel in good tracking, so the whole hardly changes where what is
+late does.  1 + a and 1 + b are the factors.  Both at once, a = b,
 is a test of its own: gains that are wrong together may show before they can be told apart.
 
 So a gain is told wrong, too high or too low, while its part is still hidden by a larger one: a good
@@ -26,10 +30,11 @@ REMEMBERED, REMEMBERED_CYCLES = 0.03, 15.0
 """s, and cycles at least, with which cycles are forgotten (time constants)."""
 FEWEST = 12.0
 """Cycles that have to be remembered before anything is said; fewer than REMEMBERED_CYCLES."""
-FED_OFF, LATE_OFF, ANY_OFF, BEGUN_OFF = 0.3, 0.05, 100.0, 30.0
+FED_OFF, LATE_OFF, TOLD_OFF, ANY_OFF, BEGUN_OFF = 0.3, 0.05, 1.0, 100.0, 30.0
 """Standard deviations before anything is seen: of the share of what is fed forward; of being late, in
-cycles, besides what is known; of the gains' shares; and of the first torque, times what is noise at
-least."""
+cycles, besides what is known; of positions that are told late, in cycles (many drives tell that of the
+cycle before, and no profile says so); of the gains' shares; and of the first torque, times what is
+noise at least."""
 OFF, SURE = 0.35, 5.0
 """Share by which a gain may be off, and standard deviations by which it has to be farther off."""
 STEPS, CLEAR = 0.7, (0.8, 2.5, 0.8)
@@ -43,6 +48,7 @@ SEEN = 3
 """Cycles after another that are enough."""
 NAMES = ("feedback", "position gain", "velocity gain")
 """What is tested: all gains of the feedback by one factor, and each of two by its own."""
+COLUMNS = 6
 TINY = 1e-300
 
 
@@ -87,20 +93,20 @@ class GainEstimate:
         """Largest shares that were surely off so far, shape (3, M)."""
         learned = np.zeros((len(NAMES), m)) if off is None else off
         self._allowed = np.where(learned > MOST_LEARNED, np.inf, np.maximum(OFF, LEARNED * learned))
-        prior = np.tile([ANY_OFF, ANY_OFF, FED_OFF, 1.0, 1.0], (m, 1))
+        prior = np.tile([ANY_OFF, ANY_OFF, FED_OFF, 1.0, TOLD_OFF, 1.0], (m, 1))
         prior[:, 3] = LATE_OFF + late / step
-        prior[:, 4] = BEGUN_OFF * np.sqrt(self._square)
-        self._prior = np.zeros((m, 5, 5))
-        self._prior[:, range(5), range(5)] = prior**-2
+        prior[:, 5] = BEGUN_OFF * np.sqrt(self._square)
+        self._prior = np.zeros((m, COLUMNS, COLUMNS))
+        self._prior[:, range(COLUMNS), range(COLUMNS)] = prior**-2
         # position and velocity gain by one factor
-        self._together = np.concatenate([np.eye(4)[:1], np.eye(4)])
+        self._together = np.concatenate([np.eye(COLUMNS - 1)[:1], np.eye(COLUMNS - 1)])
         self._fades = fades
         self.begin()
 
     def begin(self) -> None:
         """Forget what was seen."""
         m = self._square.size
-        self._normal, self._base = np.zeros((m, 5, 5)), np.zeros((m, 5))
+        self._normal, self._base = np.zeros((m, COLUMNS, COLUMNS)), np.zeros((m, COLUMNS))
         self._begun = 1.0
         self._cycles, self._squares = 0.0, np.zeros(m)
         self._since = np.zeros((len(NAMES), m), dtype=np.int64)
@@ -111,8 +117,8 @@ class GainEstimate:
         Parameters
         ----------
         parts
-            Of the expected torque, shape (4, M): by position gain, by velocity gain, fed forward, and
-            what the whole changed since the cycle before.
+            Of the expected torque, shape (5, M): by position gain, by velocity gain, fed forward, and
+            what the whole, and what the part by positions, changed since the cycle before.
         difference
             Told less expected torque, shape (M,).
         """
@@ -157,8 +163,8 @@ class GainEstimate:
         return share, np.where(hidden, np.inf, np.sqrt(variance * (1 + left / self._square)))
 
     def _left(self, shares: FloatArray) -> FloatArray:
-        """Return the mean square of what shares, (M, 5), leave of the difference, shape (M,)."""
+        """Return the mean square of what shares, (M, COLUMNS), leave of the difference, shape (M,)."""
         squares = self._squares - 2 * (shares * self._base).sum(axis=1)
         squares += np.einsum("mi,mij,mj->m", shares, self._normal, shares)
-        left: FloatArray = np.maximum(squares, 0.0) / (self._cycles - len(self._prior[0]))
+        left: FloatArray = np.maximum(squares, 0.0) / (self._cycles - COLUMNS)
         return left

@@ -47,8 +47,10 @@ LASTS, LASTING, ONE = 32, 0.45, 1.5
 on, or comes again and again for a sample or two.  One of them counts as ONE times what is allowed at
 most: an encoder's step between samples makes such a one too."""
 TINY = 1e-300
-EXPLAINS = 0.06
-"""Share of the differences' squares that being late has to explain to be believed."""
+EXPLAINS, SURE = 0.06, 3.0
+"""Share of the differences' squares that being late has to explain to be believed; or it is so many
+standard deviations from nothing, where differences count as new after SETTLES: torques that are noisy
+leave it little to explain, however long they were seen."""
 BLIND, BLIND_AGAIN = 0.015, 0.1
 """s from the beginning of a motion, and from a sample that did not come, in which nothing is said."""
 QUANTA, ENCODER, COUNT, STILL = 3.0, 4.0, 1.5, 2.5
@@ -87,7 +89,7 @@ class IdentityWatch:
         self._units = tuple(units) or ("",) * m
         self._quanta = quanta
         self._still, self._share = np.zeros(m), np.zeros(m)
-        self._lateness = np.zeros((3, m))
+        self._lateness, self._moved = np.zeros((3, m)), 0
         self._passed = SETTLES / (SETTLES + step)
         self._kept = exp(-step / REMEMBERED)
         self._standing = True
@@ -166,7 +168,8 @@ class IdentityWatch:
     def learned(self) -> Learned:
         """Return what was seen so far."""
         along, square, whole = self._lateness
-        explains = along**2 > EXPLAINS * square * whole
+        share = min(EXPLAINS, SURE**2 * SETTLES / (self._step * max(self._moved, 1)))
+        explains = along**2 > share * square * whole
         late = np.where(explains, np.abs(along) / np.maximum(square, TINY), 0.0)
         return Learned(self._still.copy(), self._share.copy(), late, self.seen, self._off_so_far)
 
@@ -233,6 +236,7 @@ class IdentityWatch:
         difference = np.abs(off)
         if self._learned is None and not self._standing:
             self._lateness += (turns * off, turns**2, difference**2)
+            self._moved += 1
         self._peak = np.maximum(np.abs(expected), self._kept * self._peak)
         self._slope = np.maximum(slope, self._kept * self._slope)
         allowed = self._floor + SHARE * self._peak + (self._late * self._slope).sum(axis=0)
@@ -243,7 +247,8 @@ class IdentityWatch:
             # what enabling did to the torque, as at the first sample, is not theirs to explain
             self._quick[-1] = expected
             return []
-        parts = np.stack([quick[0] + quick[3], quick[1] + quick[4], quick[2], changed.sum(axis=0)])
+        gained = [quick[0] + quick[3], quick[1] + quick[4], quick[2]]
+        parts = np.stack([*gained, changed.sum(axis=0), changed[1]])
         gains = [] if self._gains is None else self._gains.take(parts, off)
         self._compared += 1
         self._over = [*self._over[1 - OF :], difference / allowed]
