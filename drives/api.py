@@ -138,6 +138,10 @@ class MotionWatch(Protocol):
     def trusts_loops(self) -> bool:
         """Whether a quick stop may be left to the drives' loops; else a safety stop cuts all power."""
 
+    @property
+    def most_late(self) -> float:
+        """Seconds by which the present cycle may begin late; after more, all axes are stopped."""
+
     def take(
         self,
         position: Sequence[float],

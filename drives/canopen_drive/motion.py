@@ -22,6 +22,7 @@ from drives.canopen_drive.pace import LATE_SHARE, Punctuality
 from drives.canopen_drive.setup import HOST_HEARTBEAT, HOST_LOST_AFTER, HOST_NODE_ID
 from drives.canopen_drive.strangers import Strangers
 from drives.canopen_drive.sync import HostSync, Sync
+from drives.canopen_drive.unseen import Learned
 from drives.cia402 import ENABLED_VALUE, STEP_TOWARDS_ENABLED, Controlword, Mode, PowerState
 from drives.errors import (
     DriveFaultError,
@@ -46,6 +47,8 @@ RUNAWAY_SHARE, RUNAWAY_GROWTH, RUNAWAY_CYCLES = 0.25, 1.25, 3
 velocity limit and than it was at the start of the stop times the growth."""
 PAUSE_CYCLES, REPLY_TRIES = 3, 3
 """Cycles without SYNC before the drives' replies are timed, and tries to find them in time."""
+HELD_UP_FOR = 1.0
+"""Seconds for which an axis may swing after a cycle that began late."""
 REPLY_SHARE = 0.9
 """Share of the cycle within which the drives' PDOs have to come."""
 
@@ -82,6 +85,7 @@ class CanopenMotion:
         self._sync: Sync = sync or HostSync(line, cycle_time)
         self._disturbed, self._complete = False, True
         self._moment = line.clock.now()
+        self._held_up, self._held_up_at = 0.0, self._moment
         self._lost = line.overruns
         self._lost_before = self._lost
         self._count = 0
@@ -339,6 +343,8 @@ class CanopenMotion:
             self._or_last_resort(lambda: self._quick_stop(cut))
             self._make_sure_off()
             if cause is not None:
+                for channel in self._channels:
+                    channel.drive.learned = Learned()  # the mean of half a move is no weight
                 for sentence in self.perhaps_enabled.values():
                     cause.add_note(sentence)
                 self._explain(cause)
@@ -507,6 +513,11 @@ class CanopenMotion:
         """Have velocities judged over the time that has passed, where a SYNC was late."""
         paused = (moment - self._moment) / self._cycle_time - 1
         self._moment = moment
+        if moment - self._held_up_at > HELD_UP_FOR:
+            self._held_up = 0.0
+        if self._sync.lateness:
+            self._held_up = max(self._held_up, self._sync.lateness)
+            self._held_up_at = moment
         if paused > LATE_SHARE:
             for channel in self._channels:
                 channel.paused += paused
@@ -571,12 +582,16 @@ class CanopenMotion:
             channel.rebooted = True
 
     def _check_lateness(self) -> None:
-        if self._sync.lateness > self._most_late:
+        most, late = self._most_late, self._sync.lateness
+        if self._watch is not None:
+            most = min(most, self._watch.most_late)
+        if late > most:
             raise SafetyStopError(
-                f"this computer stood still for {1000 * self._sync.lateness:.0f} ms; a cycle may begin "
-                f"{1000 * self._most_late:.0f} ms late at most. All axes were stopped. Close other "
+                f"this computer stood still for {1000 * late:.0f} ms; a cycle may begin "
+                f"{1000 * most:.0f} ms late at most. All axes were stopped. Close other "
                 "programs, switch power saving off, and start again.",
                 cycle=self._count - 1,
+                held_up=0.0 if late > self._most_late else late,
             )
 
     def _check_user(self) -> None:
@@ -608,6 +623,7 @@ class CanopenMotion:
                     axis=channel.drive.axis,
                     cycle=self._count - 1,
                     runaway=channel.is_stuck(target) or bool(channel.alarm),
+                    held_up=self._held_up,
                 )
 
     def _look(self, targets: Sequence[int], offsets: Sequence[int]) -> None:
@@ -632,6 +648,7 @@ class CanopenMotion:
                 axis=alarm.axis,
                 cycle=self._count - 1,
                 power_off=alarm.power_off,
+                held_up=self._held_up,
             )
 
 

@@ -47,6 +47,8 @@ COUNT_SWINGS = 2.5
 ROUNDED_TARGETS = 3.5
 """Targets are whole counts: their second difference, a cycle squared apart, may swing by so many counts,
 peak to peak, and the inertia that is fed forward makes torque of it."""
+ROOM_AGAIN = 0.66
+"""Of the way to the end of the travel that a move may use where its trial is begun again."""
 STANDSTILL_TIME, STANDSTILL_TIMEOUT = 0.25, 120.0
 STANDSTILL_COUNTS, STANDSTILL_TRAVEL = 3.0, 2e-4
 """A disabled axis stands that moves by less than so many counts, or this share of its travel, in so many
@@ -72,6 +74,20 @@ class TrialPlan:
     notes: tuple[str, ...]
     bare: tuple[Servo, ...] = ()
     """The new ones as an excitation by references meets them: without what can be switched off."""
+
+
+def no_room(group: CanopenGroup, trial: Trial) -> str:
+    """Say which axis stands where a trial can not be begun any more; empty where all do well."""
+    ways = {move.axis: move.distance for move in trial.moves}
+    for k, drive in enumerate(group.drives):
+        at, (low, high), way = drive.read_position(), drive.limits.travel, ways.get(k, 0.0)
+        if not low <= at + way / ROOM_AGAIN <= high or not low <= at <= high:
+            unit = drive.position_unit
+            return (
+                f"{drive.axis} stands at {at:.4g} {unit}, from where its move of {way:.3g} {unit} has no "
+                f"room in its travel, {low:.4g} to {high:.4g} {unit}"
+            )
+    return ""
 
 
 def wait_for_standstill(group: CanopenGroup) -> None:

@@ -16,6 +16,7 @@ from drives.canopen_drive import CanopenGroup
 from drives.errors import (
     NotVerifiedError,
     OscillationError,
+    SafetyStopError,
     StoppedError,
     UserStopError,
     WriteBackMixedError,
@@ -44,6 +45,7 @@ from fieldtool.workflow.trial_guards import TrialGuards
 from fieldtool.workflow.trial_plan import (
     TrialPlan,
     encoder_swing,
+    no_room,
     plan_trial,
     torque_steps,
     wait_for_standstill,
@@ -52,6 +54,10 @@ from fieldtool.workflow.trial_records import TrialRecords
 from fieldtool.workflow.verified import Verified
 from fieldtool.writeback.temporary import backed_up
 
+TRIALS = 3
+"""Times that a trial is begun at most, where this computer stood still and then an axis swung."""
+HELD_UP = 2.0
+"""Cycles by which a cycle began late, from which that may be why."""
 LOUDER = 1.5
 """Times its swing with the old parameters by which a torque may swing at rest."""
 
@@ -204,6 +210,31 @@ class Verification:
         return self._plan
 
     def _run(self, name: str, keep: Callable[[Experiment], None], *, trusts_loops: bool) -> Tried:
+        """Do a trial; once more where this computer was late and then an axis was stopped.
+
+        Targets that stand still in a move and then go on make any axis swing: that is no word on its
+        loops.  All drives are disabled in between.
+        """
+        for left, label in zip(reversed(range(TRIALS)), _labels(name), strict=True):
+            try:
+                return self._try(name, label, keep, trusts_loops=trusts_loops)
+            except SafetyStopError as error:
+                if not left or error.held_up < HELD_UP * self._planned.trial.cycle_time:
+                    raise
+                wait_for_standstill(self._group)
+                if blocked := no_room(self._group, self._planned.trial):
+                    error.add_note(f"The trial could not be begun again: {blocked}.")
+                    raise
+                self._session.warn(
+                    f"{error} A computer that is late ({1000 * error.held_up:.0f} ms) makes axes "
+                    f"swing, so this says nothing of their loops: the trial is begun again, {left} "
+                    f"time{'s' if left > 1 else ''} at most."
+                )
+        raise AssertionError("the last trial ends or raises")
+
+    def _try(
+        self, name: str, label: str, keep: Callable[[Experiment], None], *, trusts_loops: bool
+    ) -> Tried:
         servos = self._planned.old if name == "before" else self._planned.new
         cycle = self._planned.trial.cycle_time
         pairs = zip(self._group.drives, servos, strict=True)
@@ -215,7 +246,7 @@ class Verification:
             self._planned.trial,
             self._axes,
             keep,
-            name,
+            label,
             trusts_loops=trusts_loops,
             louder=self._louder(servos),
             steps=np.array([torque_steps(drive, servo, cycle) for drive, servo in pairs]),
@@ -338,6 +369,11 @@ class Verification:
             draw_verification(self._histories, self._planned.after, folder.verification_picture)
         except Exception as failed:
             self._session.warn(f"{folder.verification_picture}: not drawn ({failed})")
+
+
+def _labels(name: str) -> tuple[str, ...]:
+    """Return what the experiments of each trial are called after: names are given once."""
+    return (name, *(f"{name}, begun again ({k})" for k in range(1, TRIALS)))
 
 
 def _what_moves(plan: TrialPlan, axes: Axes) -> str:

@@ -13,8 +13,11 @@ import yaml
 
 from drives.sim.faults import EncoderStuck, Fault, MotorReversed
 from drives.sim.firmware import Parameter
+from fieldtool.experiment.verification import steps
+from fieldtool.experiment.verification.steps import Steps
 from fieldtool.records.recording import load
 from fieldtool.records.session_folder import SessionFolder
+from fieldtool.workflow import verifying
 from fieldtool.workflow.rescued import rescue
 from tests.session.test_trial import Gains
 from tests.tunings import GOOD, begun, scale_model, write_tuning
@@ -554,3 +557,81 @@ def test_without_an_identified_model_nothing_is_stored(session):
     assert not [f for f in session.heard() if f.cob_id == 0x80], "no SYNC: nothing moved"
     assert session.changed() == {}
     assert session.stored() == {TABLE: {}, ARM: {}}
+
+
+MIDDLE = 8
+"""Slice of a move at which its axis is quick."""
+
+
+class StandsStill:
+    """The host stands still in the middle of the first moves of so many trials, after some others."""
+
+    def __init__(self, bench, monkeypatch, seconds, trials, after):
+        self.left, self.begun = trials, 0
+        stream, cut = Steps._stream, steps.slices
+
+        def noted(one, path, k, name, **more):
+            self.clock = one._motion._line.clock
+            self.now = name.endswith("move of table")
+            self.begun += self.now
+            return stream(one, path, k, name, **more)
+
+        def cut_and_wait(targets, cycle_time, turns=()):
+            source, asked = cut(targets, cycle_time, turns), iter(range(len(targets)))
+
+            def late(before):
+                if self.now and self.left and self.begun > after and next(asked) == MIDDLE:
+                    self.left -= 1
+                    self.clock.wait_until(self.clock.now() + seconds)
+                return source(before)
+
+            return late
+
+        monkeypatch.setattr(Steps, "_stream", noted)
+        monkeypatch.setattr(steps, "slices", cut_and_wait)
+
+
+@pytest.fixture
+def patient(make_bench, profile_of_two):
+    """A session on a machine whose drives may miss the host for longer."""
+    profile_of_two["bus"]["host_lost_after"] = "800 ms"
+    return begun(make_bench(profile_of_two))
+
+
+@pytest.mark.parametrize(("after", "which"), [(0, "before"), (1, "after")])
+def test_a_trial_that_a_late_host_spoiled_is_begun_again(patient, monkeypatch, after, which):
+    late = StandsStill(patient, monkeypatch, 0.14, 1, after)
+    outcome = write(patient)
+    assert outcome.code == 0, outcome.err
+    said = " ".join(outcome.out.split())
+    assert "this computer stood still for 140 ms; a cycle may begin 20 ms late at most" in said
+    assert "the trial is begun again, 2 times at most" in said
+    assert late.begun == 3
+    assert verification(patient)["verdict"] == "verified"
+    raw = load(patient.out / "verification.h5")
+    cut = [e for e in raw.experiments if not e.complete]
+    assert [e.name for e in cut] == [f"{which}: move of table"]
+    assert np.ptp(cut[0].position[:, 0]) > 0.1, "it was cut in motion"
+    assert sum(e.name.startswith(f"{which}, begun again (1): ") for e in raw.experiments) == 3
+    assert patient.powered() == {}
+
+
+@pytest.mark.parametrize(("after", "code"), [(0, 4), (1, 6)])
+def test_a_host_that_is_late_again_and_again_ends_the_trial(patient, monkeypatch, after, code):
+    late = StandsStill(patient, monkeypatch, 0.14, 9, after)
+    outcome = write(patient)
+    assert outcome.code == code, outcome.err
+    assert "stood still for 140 ms" in outcome.err
+    assert late.begun == after + 3 or "could not be begun again" in outcome.err
+    assert patient.powered() == {}
+    assert patient.changed() == {}
+
+
+def test_a_trial_without_room_is_not_begun_again(patient, monkeypatch):
+    monkeypatch.setattr(verifying, "no_room", lambda *_: "table stands at 2 rad")
+    late = StandsStill(patient, monkeypatch, 0.14, 1, 0)
+    outcome = write(patient)
+    assert outcome.code == 4
+    assert "could not be begun again: table stands at 2 rad." in " ".join(outcome.err.split())
+    assert late.begun == 1
+    assert patient.changed() == {}

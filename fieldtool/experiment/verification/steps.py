@@ -35,6 +35,9 @@ REST_AGAIN = 0.12
 ASKED, MARGIN = 4, 8
 """Times that a first answer is asked for, at most; and cycles of it that may be missing: the first ones
 of a trial, and the last ones, which are compared when later ones are known."""
+MOST_LATE, MOST_LATE_CYCLES = 0.02, 2.0
+"""Seconds, and cycles, by which a cycle of a move may begin late.  An axis whose targets stand still for
+longer stands there: it would be told to go on at full speed."""
 NO_PROBE: FloatArray = np.zeros(0)
 
 
@@ -199,12 +202,15 @@ class Steps:
         """Follow a path."""
         targets = np.tile(self._start, (path.size, 1))
         targets[:, k] += path
+        self._watch.most_late = max(MOST_LATE, MOST_LATE_CYCLES * self._motion.cycle_time)
         try:
             capture = self._motion.stream(slices(targets, self._motion.cycle_time, turns))
         except StoppedError as error:
             if isinstance(error.capture, Capture) and error.capture.rows > 1:
                 self._kept.append(self._experiment(error.capture, k, name, str(error)))
             raise
+        finally:
+            self._watch.most_late = np.inf
         if keep:
             self._kept.append(self._experiment(capture, k, name))
 

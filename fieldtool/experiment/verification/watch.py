@@ -3,6 +3,8 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from drives.api import Alarm, FloatArray
 from fieldtool.experiment.verification.identity import IdentityWatch
 from fieldtool.experiment.verification.oscillation import OscillationWatch
@@ -25,6 +27,8 @@ class TrialWatch:
     def __init__(self, names: Sequence[str], swings: OscillationWatch, guards: Guards) -> None:
         self._names, self.swings, self._guards = tuple(names), swings, guards
         self._small = True
+        self.most_late = np.inf
+        """Seconds by which the present cycle may begin late."""
 
     @property
     def trusts_loops(self) -> bool:
