@@ -132,7 +132,7 @@ def position_candidates(context: Context) -> list[Effect]:
             if info.kind == "rotary" and travel > 0.0:
                 orders = [*orders, *(o for w in FEW_WAVES if (o := 2 * np.pi * w / travel) > 1.5)]
             for order in orders:
-                low, high = (0.8, 1.25) if order * travel > 2 * np.pi * FEWEST_WAVES else (0.6, 1.6)
+                low, high = (0.7, 1.4) if order * travel > 2 * np.pi * FEWEST_WAVES else (0.6, 1.6)
                 low, high = low * order, high * order
                 number = Parameter("order", per, order, low, high, 0.1 * 2 * np.pi / travel)
                 reach = min(most, STEEPEST / order) if kind is EncoderError else most

@@ -162,11 +162,7 @@ def _band(
 
 
 def _roles(experiments: Sequence[Experiment]) -> list[Role]:
-    """Keep a third of each group of like experiments unseen, at least one of two.
-
-    Those between others, and by turns the later and the earlier of two: whatever changed at some time,
-    fits see the machine before it and after it.
-    """
+    """Keep a third of each group of like experiments unseen, at least one of two."""
     roles: list[Role] = ["fit"] * len(experiments)
     groups: list[list[int]] = []
     sizes = [np.sqrt(np.mean(e.torque**2)) for e in experiments]
@@ -181,8 +177,8 @@ def _roles(experiments: Sequence[Experiment]) -> list[Role]:
             groups.append([k])
     if any(len(group) == 1 for group in groups) and len(groups) == len(experiments):
         return roles
-    for number, group in enumerate(groups):
-        for k in (group if number % 2 == 0 else group[::-1])[1::3]:
+    for group in groups:
+        for k in group[len(group) - len(group) // 3 :] if len(group) > 2 else group[1:]:
             roles[k] = "unseen"
     return roles
 

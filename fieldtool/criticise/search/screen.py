@@ -19,7 +19,7 @@ SOONER = (1 / 8, 1 / 16, 1 / 32)
 """Of an experiment: how far from where it was tried a change may be."""
 WORTH = 0.003
 """Share of the error that a change explains, from which its time is looked for."""
-FAR = (-0.2, -0.1, -0.05, -0.02, 0.02, 0.05, 0.1, 0.25)
+FAR = (-0.3, -0.2, -0.13, -0.08, -0.05, -0.025, 0.025, 0.05, 0.1, 0.2)
 """Changes of a spring that are simulated: a resonance that moves by more than it is wide is not in any
 derivative."""
 FAR_BENT = (1e-4, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2, 0.1)
