@@ -189,19 +189,17 @@ def _solved(
     side -= at.basis @ (at.basis.T @ side)
     size = np.linalg.norm(rows, axis=0)
     active = size > 1e-9 * max(float(np.linalg.norm(columns)), 1e-300)
-    if not active.any():
-        return None
     values = np.zeros(columns.shape[1])
-    while active.any():
+    for _ in range(columns.shape[1]):
+        if not active.any():
+            return None
         solved = -np.linalg.lstsq(rows[:, active] / size[active], side, rcond=1e-10)[0]
         values[:] = 0.0
         values[active] = solved / size[active]
-        outside = active & ((values < low) | (values > high))
+        outside = (values < low) | (values > high)
         if not outside.any():
             break
         active &= ~outside
-    if not active.any():
-        return Screened(effect, dict(start), 0.0)
     values = np.clip(values, low, high)
     left = side + rows @ values
     # The gain is counted from what was there, with what the effect replaces still in place.
