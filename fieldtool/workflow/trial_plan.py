@@ -84,8 +84,8 @@ def no_room(group: CanopenGroup, trial: Trial) -> str:
         if not low <= at + way / ROOM_AGAIN <= high or not low <= at <= high:
             unit = drive.position_unit
             return (
-                f"{drive.axis} stands at {at:.4g} {unit}, from where its move of {way:.3g} {unit} has no "
-                f"room in its travel, {low:.4g} to {high:.4g} {unit}"
+                f"{drive.axis} stands at {at:.4g} {unit}, from where its move of {way:.3g} {unit} has "
+                f"no room in its travel, {low:.4g} to {high:.4g} {unit}"
             )
     return ""
 
