@@ -140,7 +140,9 @@ class MotionWatch(Protocol):
 
     @property
     def most_late(self) -> float:
-        """Seconds by which the present cycle may begin late; after more, all axes are stopped."""
+        """Seconds by which the present cycle may begin late where targets move; after more, all axes are
+        stopped.
+        """
 
     def take(
         self,

@@ -4,7 +4,7 @@ import signal
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from types import FrameType
 
 _HANG_UP = (signal.SIGHUP,) if hasattr(signal, "SIGHUP") else ()
@@ -16,9 +16,10 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM, *_HANG_UP)
 def uninterrupted() -> Iterator[None]:
     """Hold Ctrl-C and the request to end back until the block is done.
 
-    What came meanwhile acts afterwards, unless an error is on its way: then the program is ending
-    already, and the error says more.  In other threads than the main one signals never act, and
-    nothing is done.
+    What came meanwhile acts afterwards.  Where an error is on its way, that error goes on, for it says
+    more; the program's own handler is told all the same, so that nothing begins anew.
+
+    In other threads than the main one signals never act, and nothing is done.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -36,3 +37,6 @@ def uninterrupted() -> Iterator[None]:
             signal.signal(number, signal.SIG_DFL if handler is None else handler)
         if came and sys.exc_info()[0] is None:
             signal.raise_signal(came[0])
+        elif came and callable(handler := before[came[0]]):
+            with suppress(BaseException):
+                handler(came[0], None)

@@ -47,8 +47,6 @@ RUNAWAY_SHARE, RUNAWAY_GROWTH, RUNAWAY_CYCLES = 0.25, 1.25, 3
 velocity limit and than it was at the start of the stop times the growth."""
 PAUSE_CYCLES, REPLY_TRIES = 3, 3
 """Cycles without SYNC before the drives' replies are timed, and tries to find them in time."""
-HELD_UP_FOR = 1.0
-"""Seconds for which an axis may swing after a cycle that began late."""
 REPLY_SHARE = 0.9
 """Share of the cycle within which the drives' PDOs have to come."""
 
@@ -85,9 +83,10 @@ class CanopenMotion:
         self._sync: Sync = sync or HostSync(line, cycle_time)
         self._disturbed, self._complete = False, True
         self._moment = line.clock.now()
-        self._held_up, self._held_up_at = 0.0, self._moment
         self._lost = line.overruns
         self._lost_before = self._lost
+        self._targets: Sequence[int] = ()
+        """Of the cycle before, position units."""
         self._count = 0
         self._strangers = Strangers(drives, HOST_NODE_ID)
         self._stranger = ""
@@ -342,9 +341,10 @@ class CanopenMotion:
             cut = self._without_quick_stop(cause)
             self._or_last_resort(lambda: self._quick_stop(cut))
             self._make_sure_off()
-            if cause is not None:
+            if isinstance(cause, SafetyStopError) and cause.held_up:
                 for channel in self._channels:
                     channel.drive.learned = Learned()  # the mean of half a move is no weight
+            if cause is not None:
                 for sentence in self.perhaps_enabled.values():
                     cause.add_note(sentence)
                 self._explain(cause)
@@ -513,11 +513,6 @@ class CanopenMotion:
         """Have velocities judged over the time that has passed, where a SYNC was late."""
         paused = (moment - self._moment) / self._cycle_time - 1
         self._moment = moment
-        if moment - self._held_up_at > HELD_UP_FOR:
-            self._held_up = 0.0
-        if self._sync.lateness:
-            self._held_up = max(self._held_up, self._sync.lateness)
-            self._held_up_at = moment
         if paused > LATE_SHARE:
             for channel in self._channels:
                 channel.paused += paused
@@ -581,10 +576,12 @@ class CanopenMotion:
         if channel.nmt_state == 0:
             channel.rebooted = True
 
-    def _check_lateness(self) -> None:
+    def _check_lateness(self, targets: Sequence[int]) -> None:
+        """Raise SafetyStopError where a cycle began too late: sooner where targets are under way."""
         most, late = self._most_late, self._sync.lateness
-        if self._watch is not None:
+        if self._watch is not None and targets != self._targets:
             most = min(most, self._watch.most_late)
+        self._targets = targets
         if late > most:
             raise SafetyStopError(
                 f"this computer stood still for {1000 * late:.0f} ms; a cycle may begin "
@@ -612,7 +609,7 @@ class CanopenMotion:
     def _check(self, targets: Sequence[int], offsets: Sequence[int]) -> None:
         """Raise SafetyStopError for the first thing that is not as it has to be."""
         self._check_user()
-        self._check_lateness()
+        self._check_lateness(targets)
         self._check_strangers()
         self._look(targets, offsets)
         now = self._line.clock.now()
@@ -623,7 +620,6 @@ class CanopenMotion:
                     axis=channel.drive.axis,
                     cycle=self._count - 1,
                     runaway=channel.is_stuck(target) or bool(channel.alarm),
-                    held_up=self._held_up,
                 )
 
     def _look(self, targets: Sequence[int], offsets: Sequence[int]) -> None:
@@ -648,7 +644,6 @@ class CanopenMotion:
                 axis=alarm.axis,
                 cycle=self._count - 1,
                 power_off=alarm.power_off,
-                held_up=self._held_up,
             )
 
 

@@ -84,11 +84,10 @@ class _ModelFile(StrictModel):
 
 
 _PARTS = {
-    "masses": ("mass", {"rotary": "kg m2", "linear": "kg"}, False),
-    "springs": ("spring", {"rotary": "N m/rad", "linear": "N/m"}, False),
-    "dampers": ("damper", {"rotary": "N m s/rad", "linear": "N s/m"}, True),
+    "masses": ("mass", {"rotary": "kg m2", "linear": "kg"}),
+    "springs": ("spring", {"rotary": "N m/rad", "linear": "N/m"}),
 }
-"""Words, units by kind, and whether one may be 0."""
+"""Words, and units by kind.  Dampers may be below 0 within their errors: fits find them so."""
 _COUPLED = ("kg", "kg m", "kg m2")
 """Units of a coupling by how many of its axes are rotary."""
 
@@ -101,8 +100,7 @@ def read_model(path: Path | str) -> MachineModel:
     FileFormatError
         If the file is missing, larger than 1 MiB, not YAML, or not a model: an unknown or missing
         key, a value that is no number, chains that do not fit together, a mass or spring that is
-        not above 0, a damper below 0, couplings larger than their masses allow. File and line are
-        named.
+        not above 0, couplings larger than their masses allow. File and line are named.
     """
     checked, lines = read_checked(path, _ModelFile)
     names = [axis.name for axis in checked.axes]
@@ -128,21 +126,16 @@ def read_model(path: Path | str) -> MachineModel:
 
 def _refuse_impossible(path: Path | str, checked: _ModelFile, lines: Mapping[Path_, int]) -> None:
     for index, axis in enumerate(checked.axes):
-        for key, chain in (
-            ("masses", axis.masses),
-            ("springs", axis.springs or ()),
-            ("dampers", axis.dampers or ()),
-        ):
-            what, units, zero = _PARTS[key]
+        for key, chain in (("masses", axis.masses), ("springs", axis.springs or ())):
+            what, units = _PARTS[key]
             for k, one in enumerate(chain):
                 value = one.value if isinstance(one, _Estimate) else one
-                if value > 0 or (zero and value == 0):
+                if value > 0:
                     continue
-                least = "at least 0" if zero else "above 0"
                 raise FileFormatError(
                     path,
                     f"axis '{axis.name}': {what} {k + 1} (motor side first) is {value:g} "
-                    f"{units[axis.kind]}, it has to be {least}: correct it, or identify the axis again.",
+                    f"{units[axis.kind]}, it has to be above 0: correct it, or identify the axis again.",
                     line_of(lines, ("axes", index, key, k, "value")),
                 )
 

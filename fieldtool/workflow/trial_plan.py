@@ -81,11 +81,14 @@ def no_room(group: CanopenGroup, trial: Trial) -> str:
     ways = {move.axis: move.distance for move in trial.moves}
     for k, drive in enumerate(group.drives):
         at, (low, high), way = drive.read_position(), drive.limits.travel, ways.get(k, 0.0)
-        if not low <= at + way / ROOM_AGAIN <= high or not low <= at <= high:
+        least = 0.0 if trial.excitation is None else float(trial.excursion[k])
+        if min(at - least, at + way / ROOM_AGAIN) < low or high < max(
+            at + least, at + way / ROOM_AGAIN
+        ):
             unit = drive.position_unit
             return (
-                f"{drive.axis} stands at {at:.4g} {unit}, from where its move of {way:.3g} {unit} has "
-                f"no room in its travel, {low:.4g} to {high:.4g} {unit}"
+                f"{drive.axis} stands at {at:.4g} {unit}, from where its move of {way:.3g} {unit} or "
+                f"the excitation has no room in its travel, {low:.4g} to {high:.4g} {unit}."
             )
     return ""
 

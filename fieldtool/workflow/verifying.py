@@ -14,6 +14,7 @@ import numpy as np
 
 from drives.canopen_drive import CanopenGroup
 from drives.errors import (
+    DrivesError,
     NotVerifiedError,
     OscillationError,
     SafetyStopError,
@@ -28,7 +29,7 @@ from fieldtool.design.verdict import Comparison, doubts, faults
 from fieldtool.errors import IdentificationError, OutputError
 from fieldtool.experiment.axes import Axes, torque_limits
 from fieldtool.experiment.verification.oscillation import HOLD_LEVEL, LOUDEST
-from fieldtool.experiment.verification.trial import Tried, run_trial
+from fieldtool.experiment.verification.trial import Tried, run_trial, still_allowed
 from fieldtool.records.model import FloatArray, MachineModel
 from fieldtool.records.recording import Experiment, RecordingWriter
 from fieldtool.records.yaml_file import write_yaml
@@ -55,9 +56,7 @@ from fieldtool.workflow.verified import Verified
 from fieldtool.writeback.temporary import backed_up
 
 TRIALS = 3
-"""Times that a trial is begun at most, where this computer stood still and then an axis swung."""
-HELD_UP = 2.0
-"""Cycles by which a cycle began late, from which that may be why."""
+"""Times that a trial is begun at most, where this computer was late in a move."""
 LOUDER = 1.5
 """Times its swing with the old parameters by which a torque may swing at rest."""
 
@@ -210,27 +209,55 @@ class Verification:
         return self._plan
 
     def _run(self, name: str, keep: Callable[[Experiment], None], *, trusts_loops: bool) -> Tried:
-        """Do a trial; once more where this computer was late and then an axis was stopped.
+        """Do a trial; once more where this computer was late in a move, which stopped it.
 
-        Targets that stand still in a move and then go on make any axis swing: that is no word on its
-        loops.  All drives are disabled in between.
+        That is no word on the loops.  All drives are disabled in between, and nothing begins anew that
+        a person stopped, that left anything to be said, or that may have changed what is known.
         """
+        began = [drive.read_position() for drive in self._group.drives]
         for left, label in zip(reversed(range(TRIALS)), _labels(name), strict=True):
             try:
                 return self._try(name, label, keep, trusts_loops=trusts_loops)
             except SafetyStopError as error:
-                if not left or error.held_up < HELD_UP * self._planned.trial.cycle_time:
+                if not left or not error.held_up or hasattr(error, "__notes__"):
                     raise
-                wait_for_standstill(self._group)
-                if blocked := no_room(self._group, self._planned.trial):
-                    error.add_note(f"The trial could not be begun again: {blocked}.")
+                if blocked := self._blocked(began, name):
+                    error.add_note(f"The trial could not be begun again: {blocked}")
                     raise
                 self._session.warn(
-                    f"{error} A computer that is late ({1000 * error.held_up:.0f} ms) makes axes "
-                    f"swing, so this says nothing of their loops: the trial is begun again, {left} "
+                    f"{error} That says nothing of the loops: the trial is begun again, {left} "
                     f"time{'s' if left > 1 else ''} at most."
                 )
         raise AssertionError("the last trial ends or raises")
+
+    def _blocked(self, began: Sequence[float], name: str) -> str:
+        """Say why a trial can not be begun again where the axes stand now; empty if it can.
+
+        The old parameters' trial begins from anywhere and learns anew.  With the new ones it is compared
+        with torques at rest that are known where the old one began.
+
+        Raises
+        ------
+        UserStopError
+            If a person stopped meanwhile.
+        """
+        if self._group.stop_requested():
+            raise UserStopError("stopped by the user; no axis was moving, all are disabled.")
+        try:
+            wait_for_standstill(self._group)
+            if text := no_room(self._group, self._planned.trial):
+                return text
+            now = [drive.read_position() for drive in self._group.drives]
+        except (DrivesError, IdentificationError) as error:
+            return str(error)
+        if self._group.stop_requested():
+            raise UserStopError("stopped by the user; no axis was moving, all are disabled.")
+        if name == "before":
+            self._guards = None
+            return ""
+        far = np.abs(np.subtract(now, began)) > still_allowed(self._axes)
+        away = [axis for axis, is_far in zip(self._axes.names, far, strict=True) if is_far]
+        return f"{', '.join(away)} is not where it began. Write again." if away else ""
 
     def _try(
         self, name: str, label: str, keep: Callable[[Experiment], None], *, trusts_loops: bool

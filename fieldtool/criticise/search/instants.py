@@ -14,6 +14,8 @@ from fieldtool.criticise.simulate.motion import Motion
 FloatArray = NDArray[np.float64]
 PARTS = 20
 """Instants of an experiment that are tried, and again around the best of them to either side."""
+MOST = 16
+"""Instants that are tried of a whole recording."""
 AGAIN = 3
 """Times at most that the rest is fitted beside a better instant."""
 
@@ -21,11 +23,12 @@ AGAIN = 3
 def instants(simulator: Simulator) -> list[float]:
     """Return instants, s, of which no two are alike to the rows of role ``fit``.
 
-    Three within each experiment that is seen, and one in each gap between two of them.
+    Three within each experiment that is seen, and one in each gap between two of them; MOST of all.
     """
     seen = _seen(simulator)
     within = [m.clock[0] + s * (m.clock[-1] - m.clock[0]) for m in seen for s in (0.25, 0.5, 0.75)]
-    return sorted(float(t) for t in [*within, *(m.clock[0] for m in seen[1:])])
+    times = sorted(float(t) for t in [*within, *(m.clock[0] for m in seen[1:])])
+    return times if len(times) <= MOST else [times[k * len(times) // MOST] for k in range(MOST)]
 
 
 def timed(simulator: Simulator, fitted: Fitted, place: int) -> Fitted:
@@ -88,8 +91,8 @@ def _best(
 ) -> tuple[float, float]:
     """Return the least cost and its instant, of all in some motions and now."""
     now = fitted.hypothesis.values[place]["time"]
-    step = (around[0].clock[-1] - around[0].clock[0]) / PARTS
-    coarse = [m.clock[0] + step * np.arange(PARTS) for m in around]
+    coarse = [np.linspace(m.clock[0], m.clock[-1], PARTS, endpoint=False) for m in around]
+    step = max((m.clock[-1] - m.clock[0]) / PARTS for m in around)
     best = _least(simulator, fitted, place, np.concatenate([[now], *coarse]), roles)
     # What a changed spring rings with has a minimum every half cycle.
     fine = best[1] + step * np.linspace(-1.0, 1.0, 2 * PARTS + 1)

@@ -35,6 +35,8 @@ REST_AGAIN = 0.12
 ASKED, MARGIN = 4, 8
 """Times that a first answer is asked for, at most; and cycles of it that may be missing: the first ones
 of a trial, and the last ones, which are compared when later ones are known."""
+MOVED = 3
+"""Times that a move is made at most, where cycles were late or frames were lost."""
 MOST_LATE, MOST_LATE_CYCLES = 0.02, 2.0
 """Seconds, and cycles, by which a cycle of a move may begin late.  An axis whose targets stand still for
 longer stands there: it would be told to go on at full speed."""
@@ -137,12 +139,18 @@ class Steps:
         self._stream(path, move.axis, f"{self._name}: nudge of {axes.names[k]}", keep=False)
 
     def move(self, move: TrialMove) -> None:
-        """Go the whole way, rest, come back, rest."""
+        """Go the whole way, rest, come back, rest; once more where samples are missing."""
+        name = f"{self._name}: move of {self._axes.names[move.axis]}"
+        for again in range(MOVED):
+            if not self._move(move, f"{name} ({again + 1})" if again else name):
+                break
+
+    def _move(self, move: TrialMove, name: str) -> bool:
+        """Do a move once; return whether samples are missing."""
         out, rest = move.reference, np.ones(move.rest)
         self._watch.move(small=False)
         path = np.concatenate([out, move.distance * rest, move.distance - out, 0 * rest])
         self._allow(move)
-        name = f"{self._name}: move of {self._axes.names[move.axis]}"
         half = out.size + move.rest
         late = SENT_AHEAD * round(SLICE_TIME / self._motion.cycle_time)
         turns = [(half, partial(self._allow, move, back=True))]
@@ -152,7 +160,7 @@ class Steps:
                 *turns,
                 (half + out.size + late, partial(self._settle, move, back=True)),
             ]
-        self._stream(path, move.axis, name, turns=turns)
+        return bool(self._stream(path, move.axis, name, turns=turns).missing)
 
     def _settle(self, move: TrialMove, *, back: bool) -> None:
         """Allow the axis what is left of its move, about its target."""
@@ -198,8 +206,8 @@ class Steps:
         *,
         keep: bool = True,
         turns: Sequence[Turn] = (),
-    ) -> None:
-        """Follow a path."""
+    ) -> Capture:
+        """Follow a path; return what was captured of it."""
         targets = np.tile(self._start, (path.size, 1))
         targets[:, k] += path
         self._watch.most_late = max(MOST_LATE, MOST_LATE_CYCLES * self._motion.cycle_time)
@@ -213,6 +221,7 @@ class Steps:
             self._watch.most_late = np.inf
         if keep:
             self._kept.append(self._experiment(capture, k, name))
+        return capture
 
     def _experiment(self, capture: Capture, k: int, name: str, note: str = "") -> Experiment:
         driven = (self._axes.names[k],)

@@ -76,8 +76,9 @@ class Tried:
     """How far each axis went as it was enabled, while it was told to stand, shape (M,)."""
 
     def move(self, axis: str) -> Experiment | None:
-        """Return the move of an axis; None if there was none."""
-        return next((e for e in self.experiments if e.driven == (axis,)), None)
+        """Return the last move of an axis; None if there was none."""
+        moves = [e for e in self.experiments if e.kind == "moves" and e.driven == (axis,)]
+        return moves[-1] if moves else None
 
     @property
     def excitation(self) -> Experiment | None:

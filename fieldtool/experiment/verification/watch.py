@@ -28,7 +28,7 @@ class TrialWatch:
         self._names, self.swings, self._guards = tuple(names), swings, guards
         self._small = True
         self.most_late = np.inf
-        """Seconds by which the present cycle may begin late."""
+        """Seconds by which the present cycle may begin late where targets move."""
 
     @property
     def trusts_loops(self) -> bool:
