@@ -13,7 +13,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from drives.api import Capture
 from drives.errors import SafetyStopError, StoppedError
-from fieldtool.errors import LoopUnstableError
+from fieldtool.errors import LoopUnstableError, NotEnoughDataError
 from fieldtool.experiment.axes import Axes, Keep, keep_whatever_happens, sample_times
 from fieldtool.experiment.forecast import Setting
 from fieldtool.experiment.multisine.growth import GrowthWatch
@@ -30,6 +30,8 @@ SWINGS = 2
 """Periods of it in that time, at least."""
 ONE_FREQUENCY = 0.8
 """Share of its power about one frequency."""
+FASTEST = 1e-5
+"""Seconds in which no motion of a machine grows by a factor of e."""
 SAME_ROWS = 20
 """So many rows in a row that are the same in two records are the same rows."""
 
@@ -88,6 +90,8 @@ def check_loops(setting: Setting) -> None:
     ------
     LoopUnstableError
         Naming the axis whose motor takes most part in what grows.
+    NotEnoughDataError
+        If it would grow faster than any loop's motion can: then the pilot's model is no machine's.
     """
     loop = setting.closed_loop(())
     if loop.stable:
@@ -96,6 +100,13 @@ def check_loops(setting: Setting) -> None:
     worst = int(np.argmax(values.real))
     rate, omega = float(values[worst].real), abs(float(values[worst].imag))
     name = setting.model.names[int(np.argmax(np.abs(vectors[setting.model.first_masses, worst])))]
+    if rate * FASTEST > 1:
+        raise NotEnoughDataError(
+            f"{name}: the pilot did not show its masses and springs: by what it found a motion would "
+            f"grow by a factor of e in {1 / rate:.2g} s, which no machine does. All axes are disabled, "
+            "and the raw data are kept. Does the axis have as many masses as its profile says? If so, "
+            "measure with the classic plan (--plan classic)."
+        )
     grows = f"an oscillation at {omega / (2 * np.pi):.3g} Hz" if omega else "a motion"
     raise LoopUnstableError(
         f"{name}: its loop is unstable: by what the pilot has shown of the masses and springs, {grows} "
