@@ -44,6 +44,7 @@ from fieldtool.criticise.search.fit import fit
 from fieldtool.criticise.search.instants import timed as timed_best
 from fieldtool.criticise.search.screen import screened, tangent
 from fieldtool.criticise.where.sentences import relative_error
+from fieldtool.errors import NotEnoughDataError
 from tests.hidden.hiding import MAKERS, draw
 from tests.hidden.plant_recordings import random_machine, record
 from tests.hidden.scoring import cause_of, is_of, numbers, tie_with
@@ -87,7 +88,12 @@ def told(criticised, hidden):
 def judged(kind, case, without=frozenset(), with_told=False):
     """Criticise one case; return its line."""
     begin = time.process_time()
-    criticised = criticise(case.recording, case.machine.model, case.machine.model, without=without)
+    try:
+        criticised = criticise(
+            case.recording, case.machine.model, case.machine.model, without=without
+        )
+    except NotEnoughDataError as error:
+        return refused(kind, case, str(error))
     seconds = time.process_time() - begin
     c = criticised.criticism
     first = c.causes[0] if c.causes else None
@@ -126,6 +132,24 @@ def judged(kind, case, without=frozenset(), with_told=False):
         if x is not None
     }
     return line
+
+
+def refused(kind, case, why):
+    """Line of a case of which criticism says nothing but why: nothing is found, nothing is wrong."""
+    hidden = [
+        {
+            "effect": h.effect,
+            "axis": h.axis + 1,
+            "size": round(h.visibility, 2),
+            "part": repr(h.part),
+        }
+        for h in case.hidden
+    ]
+    return {
+        "kind": kind, "seed": case.seed, "axes": len(case.machine.hardware), "hidden": hidden,
+        "named": [], "verdict": "refused", "why": why, "numbers": {}, "first": False, "tie": False,
+        "seconds": 0.0,
+    }  # fmt: skip
 
 
 def kept(keep):
