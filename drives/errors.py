@@ -26,6 +26,7 @@
 from collections.abc import Collection, Mapping
 from pathlib import Path
 
+STOPPED_AT_REST = "stopped by the user; no axis was moving, all are disabled."
 LONGEST = 1000
 """Characters of a message about a profile."""
 

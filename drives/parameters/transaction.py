@@ -5,6 +5,7 @@ from contextlib import suppress
 
 from drives.canopen_drive.interrupts import uninterrupted
 from drives.errors import (
+    STOPPED_AT_REST,
     DrivesError,
     SdoAbortError,
     SdoError,
@@ -146,7 +147,7 @@ class Transaction:
     def _heed_stop(self) -> None:
         """End the write if the user asked for it: a trial that has just ended no longer asks."""
         if self._stop_requested():
-            raise UserStopError("stopped by the user; no axis was moving, all are disabled.")
+            raise UserStopError(STOPPED_AT_REST)
 
     def _step_forward(self, step: Step) -> None:
         self._tell(step)

@@ -8,13 +8,12 @@ from time import monotonic
 from types import FrameType
 
 from drives.canopen_drive.interrupts import SIGNALS
-from drives.errors import UserStopError
+from drives.errors import STOPPED_AT_REST, UserStopError
 from fieldtool.cli.output import confirmed
 from fieldtool.errors import PlanRefusedError
 
 ASKED_WITHIN = 0.5
 """Seconds: a motion asks for a stop so often, at least."""
-STOPPED_AT_REST = "stopped by the user; no axis was moving, all are disabled."
 
 
 class StopKey:

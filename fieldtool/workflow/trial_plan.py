@@ -48,7 +48,8 @@ ROUNDED_TARGETS = 3.5
 """Targets are whole counts: their second difference, a cycle squared apart, may swing by so many counts,
 peak to peak, and the inertia that is fed forward makes torque of it."""
 ROOM_AGAIN = 0.66
-"""Of the way to the end of the travel that a move may use where its trial is begun again."""
+"""Of the way to the end of the travel that a move may use where its trial is begun again: more than
+ROOM of a planned one, for the axis coasted a little since."""
 STANDSTILL_TIME, STANDSTILL_TIMEOUT = 0.25, 120.0
 STANDSTILL_COUNTS, STANDSTILL_TRAVEL = 3.0, 2e-4
 """A disabled axis stands that moves by less than so many counts, or this share of its travel, in so many
@@ -82,9 +83,8 @@ def no_room(group: CanopenGroup, trial: Trial) -> str:
     for k, drive in enumerate(group.drives):
         at, (low, high), way = drive.read_position(), drive.limits.travel, ways.get(k, 0.0)
         least = 0.0 if trial.excitation is None else float(trial.excursion[k])
-        if min(at - least, at + way / ROOM_AGAIN) < low or high < max(
-            at + least, at + way / ROOM_AGAIN
-        ):
+        end = at + way / ROOM_AGAIN
+        if min(at - least, end) < low or high < max(at + least, end):
             unit = drive.position_unit
             return (
                 f"{drive.axis} stands at {at:.4g} {unit}, from where its move of {way:.3g} {unit} or "

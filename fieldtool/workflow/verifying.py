@@ -14,6 +14,7 @@ import numpy as np
 
 from drives.canopen_drive import CanopenGroup
 from drives.errors import (
+    STOPPED_AT_REST,
     DrivesError,
     NotVerifiedError,
     OscillationError,
@@ -171,8 +172,7 @@ class Verification:
             with self._recording() as keep:
                 tried = self._run("after", keep, trusts_loops=False)
             reasons = self._judge(tried)
-            if self._group.stop_requested():
-                raise UserStopError("stopped by the user; no axis was moving, all are disabled.")
+            self._heed_stop()
         except UserStopError:
             reasons = ("the user stopped the trial",)
             raise
@@ -228,6 +228,8 @@ class Verification:
                     f"{error} That says nothing of the loops: the trial is begun again, {left} "
                     f"time{'s' if left > 1 else ''} at most."
                 )
+                if name == "before":
+                    self._guards = None  # it begins where the axes stand now, and learns anew
         raise AssertionError("the last trial ends or raises")
 
     def _blocked(self, began: Sequence[float], name: str) -> str:
@@ -241,23 +243,26 @@ class Verification:
         UserStopError
             If a person stopped meanwhile.
         """
-        if self._group.stop_requested():
-            raise UserStopError("stopped by the user; no axis was moving, all are disabled.")
+        self._heed_stop()
         try:
             wait_for_standstill(self._group)
             if text := no_room(self._group, self._planned.trial):
                 return text
             now = [drive.read_position() for drive in self._group.drives]
+        except UserStopError:
+            raise
         except (DrivesError, IdentificationError) as error:
             return str(error)
-        if self._group.stop_requested():
-            raise UserStopError("stopped by the user; no axis was moving, all are disabled.")
+        self._heed_stop()
         if name == "before":
-            self._guards = None
             return ""
         far = np.abs(np.subtract(now, began)) > still_allowed(self._axes)
         away = [axis for axis, is_far in zip(self._axes.names, far, strict=True) if is_far]
         return f"{', '.join(away)} is not where it began. Write again." if away else ""
+
+    def _heed_stop(self) -> None:
+        if self._group.stop_requested():
+            raise UserStopError(STOPPED_AT_REST)
 
     def _try(
         self, name: str, label: str, keep: Callable[[Experiment], None], *, trusts_loops: bool

@@ -101,10 +101,7 @@ def judged(kind, case, without=frozenset(), with_told=False):
         "kind": kind,
         "seed": case.seed,
         "axes": len(case.machine.hardware),
-        "hidden": [
-            {"effect": h.effect, "axis": h.axis + 1, "size": round(h.visibility, 2),
-             "part": repr(h.part)} for h in case.hidden
-        ],
+        "hidden": hidden_in(case),
         "named": [
             {"effect": x.effect, "axis": x.axis, "location": x.location, "gain": x.gain,
              "chance": x.chance, "ties": [[t.effect, t.axis] for t in x.ties],
@@ -134,21 +131,20 @@ def judged(kind, case, without=frozenset(), with_told=False):
     return line
 
 
+def hidden_in(case):
+    """What was hidden in a case, as its line says it."""
+    return [
+        {"effect": h.effect, "axis": h.axis + 1, "size": round(h.visibility, 2),
+         "part": repr(h.part)} for h in case.hidden
+    ]  # fmt: skip
+
+
 def refused(kind, case, why):
     """Line of a case of which criticism says nothing but why: nothing is found, nothing is wrong."""
-    hidden = [
-        {
-            "effect": h.effect,
-            "axis": h.axis + 1,
-            "size": round(h.visibility, 2),
-            "part": repr(h.part),
-        }
-        for h in case.hidden
-    ]
     return {
-        "kind": kind, "seed": case.seed, "axes": len(case.machine.hardware), "hidden": hidden,
-        "named": [], "verdict": "refused", "why": why, "numbers": {}, "first": False, "tie": False,
-        "seconds": 0.0,
+        "kind": kind, "seed": case.seed, "axes": len(case.machine.hardware),
+        "hidden": hidden_in(case), "named": [], "verdict": "refused", "why": why, "numbers": {},
+        "first": False, "tie": False, "seconds": 0.0,
     }  # fmt: skip
 
 

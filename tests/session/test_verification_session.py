@@ -670,6 +670,24 @@ def test_a_stop_while_axes_are_stopped_for_a_late_host_begins_nothing_again(pati
     assert patient.changed() == {}
 
 
+def test_a_stop_while_axes_are_waited_for_begins_nothing_again(patient, monkeypatch):
+    late = StandsStill(patient, monkeypatch, 0.14, 1, 0)
+    wait = verifying.wait_for_standstill
+
+    def pressed(group):
+        if late.begun and not late.left:
+            signal.raise_signal(signal.SIGINT)
+        wait(group)
+
+    monkeypatch.setattr(verifying, "wait_for_standstill", pressed)
+    outcome = write(patient)
+    assert outcome.code == 130, outcome.err
+    assert "stopped by the user" in outcome.err
+    assert late.begun == 1
+    assert patient.powered() == {}
+    assert patient.changed() == {}
+
+
 def test_a_move_with_a_late_cycle_while_axes_rest_is_made_once_more(patient, monkeypatch):
     late = StandsStill(patient, monkeypatch, 0.04, 1, 0)
     monkeypatch.setattr(f"{__name__}.MIDDLE", 80)

@@ -129,6 +129,10 @@ class Effect:
         """Return torques at the motor whose size may differ from experiment to experiment, (n,) each."""
         return ()
 
+    def far(self, instants: Sequence[float]) -> list[dict[str, float]]:
+        """Return start values too far off for derivatives, to be simulated; ``instants`` differ, s."""
+        return []
+
     def implausible(self, values: Values, context: "Context") -> str:
         """Say why these values are no physical answer; empty where they are."""
         return ""

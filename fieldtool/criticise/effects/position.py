@@ -16,9 +16,9 @@ FEWEST_WAVES = 1.5
 FEW_WAVES = (0.5, 0.75, 1.0)
 """Waves within the travel that are tried besides, where gravity could be meant as well."""
 MOST_ORDERS = 4000
-WAVING, STEEPEST = 0.05, 0.5
-"""Largest error of an encoder over the travel, and its slope: with 1 and more, a position would be told
-twice."""
+WAVING, STEEPEST = 0.05, 0.4
+"""Largest error of an encoder over the travel, and the slope of its sine and cosine each: with 1 or
+more of both together, whose order may rise besides, a position would be told twice."""
 BINS = 8
 """Bins of the position per wave of the highest order."""
 

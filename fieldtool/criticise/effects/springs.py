@@ -3,6 +3,7 @@
 Also damping inside the material (structural damping), and a further mass on a spring.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -16,10 +17,11 @@ LOSS = 0.05
 """Start value of the damper of a contact over the root of stiffness times mass."""
 BRANCHES = 7
 """Maxwell branches that make damping nearly the same at all frequencies."""
-
-
-def _dofs(context_first: int, spring: int) -> tuple[int, int]:
-    return context_first + spring, context_first + spring + 1
+FAR = (-0.3, -0.2, -0.13, -0.08, -0.05, -0.025, 0.025, 0.05, 0.1, 0.2)
+"""Changes of a spring that are simulated: a resonance that moves by more than it is wide is not in any
+derivative."""
+FAR_BENT = (1e-4, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2, 0.1)
+"""The same of springs that harden or soften, over the most."""
 
 
 class SpringEffect(Effect):
@@ -36,7 +38,16 @@ class SpringEffect(Effect):
         return -float(structure.stiffness[a, b]), -float(structure.damping[a, b])
 
 
-class HardeningSpring(SpringEffect):
+class CubicSpring(SpringEffect):
+    """A spring that is no straight line; ``cubic`` is its only number."""
+
+    def far(self, instants: Sequence[float]) -> list[dict[str, float]]:
+        """Return shares of the most."""
+        (cubic,) = self.parameters
+        return [{cubic.name: share * (cubic.low + cubic.high)} for share in FAR_BENT]
+
+
+class HardeningSpring(CubicSpring):
     """Stiffer when it is stretched further."""
 
     name = "hardening_spring"
@@ -51,7 +62,7 @@ class HardeningSpring(SpringEffect):
         return structure.with_elements(Element(Law.CUBIC, a, b, (values["cubic"], 0.0, 0.0, 0.0)))
 
 
-class SofteningSpring(SpringEffect):
+class SofteningSpring(CubicSpring):
     """Softer when it is stretched further, and never pushing away: a cubic alone runs away."""
 
     name = "softening_spring"
@@ -117,6 +128,10 @@ class StiffnessChange(SpringEffect):
         k, _ = self.stiffness_of(structure)
         step = (k * values["change"], values["time"], 0.0, 0.0)
         return structure.with_elements(Element(Law.STEP, a, b, step))
+
+    def far(self, instants: Sequence[float]) -> list[dict[str, float]]:
+        """Return changes at each instant."""
+        return [{"change": change, "time": time} for time in instants for change in FAR]
 
 
 class StructuralDamping(SpringEffect):

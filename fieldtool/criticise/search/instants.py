@@ -34,8 +34,6 @@ def instants(simulator: Simulator) -> list[float]:
 def timed(simulator: Simulator, fitted: Fitted, place: int) -> Fitted:
     """Return a fit with the instant of one effect at which least is left, where that is another.
 
-    An instant that lies between what was seen is no matter to a fit: it is where all data have it.
-
     Parameters
     ----------
     simulator : Simulator
@@ -43,10 +41,15 @@ def timed(simulator: Simulator, fitted: Fitted, place: int) -> Fitted:
     place : int
         Of an effect with a number named ``time``, s.
     """
+    return _between(simulator, _within(simulator, fitted, place), place)
+
+
+def _within(simulator: Simulator, fitted: Fitted, place: int) -> Fitted:
+    """Return the fit with the best instant of the experiment in which it is; by what is seen."""
     seen = _seen(simulator)
     for _ in range(AGAIN):
         if not np.isfinite(fitted.cost):
-            return fitted
+            break
         now = fitted.hypothesis.values[place]["time"]
         around = [m for m in seen if m.clock[0] <= now <= m.clock[-1]]
         if not around:
@@ -58,7 +61,17 @@ def timed(simulator: Simulator, fitted: Fitted, place: int) -> Fitted:
         if not better.cost < fitted.cost:
             break
         fitted = better
-    now = fitted.hypothesis.values[place]["time"]
+    return fitted
+
+
+def _between(simulator: Simulator, fitted: Fitted, place: int) -> Fitted:
+    """Return the fit with an instant that lies between what was seen where all data have it.
+
+    It is no matter to the fit.
+    """
+    if not np.isfinite(fitted.cost):
+        return fitted
+    seen, now = _seen(simulator), fitted.hypothesis.values[place]["time"]
     compared = [
         (m.clock[lines.span.start], m.clock[lines.span.stop - 1])
         for lines in simulator.lines

@@ -66,7 +66,7 @@ def best_mode(
     mode : Effect
         An ``extra_mode``: its bounds are kept.
     """
-    mass, frequency, damping = mode.parameters
+    mass, frequency, _ = mode.parameters
     sought = _lines(simulator, hypothesis, side, basis, mode)
     count = max(2, int(np.log(frequency.high / frequency.low) / np.log(APART)))
     frequencies = np.geomspace(2.0 * frequency.low, frequency.high / 1.1, count)
@@ -76,13 +76,19 @@ def best_mode(
     near = best[1] * np.geomspace(1.0 / APART, APART, FINER)
     masses = best[0] * np.array([1.0] if at_motor else [0.3, 0.6, 1.0, 1.8])
     m, f, z = _tried(sought, masses, near, np.array(DAMPINGS_FINER))
-    m = mass.clipped(m)
+    return started(mode, m, f, z)
+
+
+def started(mode: Effect, m: float, f: float, z: float) -> Effect:
+    """Return a further mass with start values within its bounds: mass, frequency, Hz, damping ratio."""
+    mass, frequency, damping = mode.parameters
+    m, f, z = mass.clipped(m), frequency.clipped(f), damping.clipped(z)
     return replace(
         mode,
         parameters=(
             replace(mass, start=0.0, scale=m),
-            replace(frequency, start=frequency.clipped(f), scale=max(z, DAMPINGS[0]) * f),
-            replace(damping, start=damping.clipped(z), scale=0.5 * damping.clipped(z)),
+            replace(frequency, start=f, scale=max(z, DAMPINGS[0]) * f),
+            replace(damping, start=z, scale=0.5 * z),
         ),
     )
 

@@ -19,13 +19,10 @@ SOONER = (1 / 8, 1 / 16, 1 / 32)
 """Of an experiment: how far from where it was tried a change may be."""
 WORTH = 0.003
 """Share of the error that a change explains, from which its time is looked for."""
-FAR = (-0.3, -0.2, -0.13, -0.08, -0.05, -0.025, 0.025, 0.05, 0.1, 0.2)
-"""Changes of a spring that are simulated: a resonance that moves by more than it is wide is not in any
-derivative."""
-FAR_BENT = (1e-4, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2, 0.1)
-"""The same of springs that harden or soften, over the most."""
 EXPLAINED = 0.5
 """Share of the error that the best candidate is expected to explain, from which they are not."""
+LINEAR = 0.6
+"""Share of the time that derivatives take, where changes are simulated after them."""
 SMALLEST_PART = 0.02
 """Of a start value, that is left of it at least."""
 
@@ -79,7 +76,7 @@ def screened(
     """Return the candidates by falling gain, for each place of each effect the best start only."""
     best: dict[object, Screened] = {}
     for k, candidate in enumerate(candidates):
-        advance(k / max(len(candidates), 1))
+        advance(LINEAR * k / max(len(candidates), 1))
         effect = candidate
         if effect.name == "extra_mode":
             effect = best_mode(simulator, at.hypothesis, at.side, at.basis, effect)
@@ -91,7 +88,8 @@ def screened(
             best[key] = _in_time(simulator, at, one)
     cost = float(at.side @ at.side)
     if all(b.gain < EXPLAINED * cost for b in best.values()):
-        for key, one in best.items():
+        for k, (key, one) in enumerate(best.items()):
+            advance(LINEAR + (1.0 - LINEAR) * k / len(best))
             best[key] = _far(simulator, at, one)
     return sorted(best.values(), key=lambda s: -s.gain)
 
@@ -115,16 +113,10 @@ def _in_time(simulator: Simulator, at: Tangent, one: Screened) -> Screened:
 
 
 def _far(simulator: Simulator, at: Tangent, one: Screened) -> Screened:
-    """Return a start from a larger change of a spring, simulated, where more is gained."""
-    starts: list[dict[str, float]] = []
-    if one.effect.name == "stiffness_change":
-        starts = [{"change": c, "time": t} for t in instants(simulator) for c in FAR]
-    elif one.effect.name in ("hardening_spring", "softening_spring"):
-        cubic = one.effect.parameters[0]
-        starts = [{cubic.name: share * (cubic.low + cubic.high)} for share in FAR_BENT]
+    """Return a start that is too far off for derivatives, simulated, where more is gained."""
     grown = at.hypothesis.with_effect(one.effect)
     cost = float(at.side @ at.side)
-    for start in starts:
+    for start in one.effect.far(instants(simulator)):
         r = simulator.residual(replace(grown, values=(*grown.values[:-1], start)), "fit")
         gain = cost - float(r @ r)
         if gain > one.gain:  # what is not finite is not larger

@@ -21,10 +21,11 @@ from fieldtool.criticise.search.afterwards import (
     unsigned,
 )
 from fieldtool.criticise.search.fit import EXACTLY, Fitted, fit, strain
-from fieldtool.criticise.search.hypothesis import Hypothesis
+from fieldtool.criticise.search.hypothesis import Hypothesis, Simulator
 from fieldtool.criticise.search.instants import timed
 from fieldtool.criticise.search.judge import Parts, beyond_noise, difference, judged, moved
 from fieldtool.criticise.search.marks import Unmarked, marked, on_all_rows
+from fieldtool.criticise.search.other_end import at_other_end
 from fieldtool.criticise.search.prepare import Prepared, reweighted
 from fieldtool.criticise.search.rules import (
     ALIKE_T,
@@ -243,7 +244,7 @@ def _round(
                     clear = max(clear, one.gain)
         if any(_clear(t) for t in best.values()):
             break
-    tried = list(best.values())
+    tried = _with_other_end(simulator, list(best.values()), unseen)
     good = []
     for candidate in tried:
         why = _why_not(prepared, context, accepted, candidate)
@@ -261,6 +262,22 @@ def _round(
     if accepted:
         return [], looked  # what pairs alone explain is looked for once, before anything has a name
     return _pair(prepared, context, current, accepted, at, chosen[:PAIRED], unseen), looked
+
+
+def _with_other_end(simulator: Simulator, tried: Sequence[Tried], unseen: Parts) -> list[Tried]:
+    """Try a further mass that does best at the other end of its chain: the motor hardly tells them."""
+    out = {t.effect.key: t for t in tried}
+    least = min(tried, key=lambda t: t.fitted.cost, default=None)
+    if least is None or least.effect.name != "extra_mode":
+        return list(out.values())
+    hung = at_other_end(least.fitted.hypothesis)
+    if hung is None:
+        return list(out.values())
+    fitted = fit(simulator, hung)
+    key = fitted.hypothesis.effects[-1].key
+    if key not in out or fitted.cost < out[key].fitted.cost:
+        out[key] = judged(simulator, fitted, fitted.hypothesis.effects[-1], unseen)
+    return list(out.values())
 
 
 def _clear(tried: Tried) -> bool:
