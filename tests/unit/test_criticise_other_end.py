@@ -13,7 +13,7 @@ from fieldtool.criticise.effects.springs import ExtraMode
 from fieldtool.criticise.search.hypothesis import Hypothesis
 from fieldtool.criticise.search.machine import Machine
 from fieldtool.criticise.search.other_end import at_other_end
-from fieldtool.records.model import AxisModel, Estimate, MachineModel
+from fieldtool.records.model import AxisModel, Coupling, Estimate, MachineModel
 from tests.unit.test_criticise_search import MODEL, recorded
 
 NUMBER = st.floats(0.2, 5.0)
@@ -86,6 +86,17 @@ def test_a_single_mass_has_no_other_end():
     machine = Machine.of(chain([1.0], []), np.ones(1))
     values = {"mass": 0.1, "frequency": 10.0, "damping_ratio": 0.01}
     hypothesis = Hypothesis(machine, machine.start, (mode("motor"),), (values,))
+    assert at_other_end(hypothesis) is None
+
+
+def test_what_a_coupling_does_not_allow_is_not_tried():
+    """Most of the last mass goes behind it: it alone does not bear the coupling that it had."""
+    a = chain([1.0, 1.0], [1.0], [0.01]).axes[0]
+    machine = MachineModel((a, replace(a, name="b")), (Coupling(("a", "b"), 0.6),))
+    start = Machine.of(machine, np.ones(2))
+    values = {"mass": 0.03, "frequency": 5.0 / (2 * np.pi), "damping_ratio": 0.01}
+    hypothesis = Hypothesis(start, start.start, (mode("motor"),), (values,))
+    assert start.physical(start.start)
     assert at_other_end(hypothesis) is None
 
 

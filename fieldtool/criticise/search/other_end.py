@@ -23,7 +23,7 @@ def at_other_end(fitted: Hypothesis) -> Hypothesis | None:
     """Return what a hypothesis, whose last effect is a further mass, says with it at the other end.
 
     It is alike to the motor without damping and with the other axes held; None where the chain has no
-    other end.
+    other end, or the couplings that the other axes ask for are more than the masses there bear.
     """
     mode = fitted.effects[-1]
     values, names = fitted.values[-1], fitted.machine.names
@@ -50,6 +50,9 @@ def at_other_end(fitted: Hypothesis) -> Hypothesis | None:
         (masses, springs), mass, stiffness = chains[k], shares[k], shares[k] * rates[k]
     base = fitted.base.copy()
     base[places[0]], base[places[1]] = masses, springs
+    base = fitted.machine.clipped(base)
+    if not (mass > 0.0 and stiffness > 0.0 and fitted.machine.physical(base)):
+        return None
     frequency = float(np.sqrt(stiffness / mass) / (2 * np.pi))
     hung = started(
         replace(mode, location="load" if mode.location == "motor" else "motor", number=0),

@@ -275,7 +275,7 @@ def _with_other_end(simulator: Simulator, tried: Sequence[Tried], unseen: Parts)
         return list(out.values())
     fitted = fit(simulator, hung)
     key = fitted.hypothesis.effects[-1].key
-    if key not in out or fitted.cost < out[key].fitted.cost:
+    if np.isfinite(fitted.cost) and (key not in out or fitted.cost < out[key].fitted.cost):
         out[key] = judged(simulator, fitted, fitted.hypothesis.effects[-1], unseen)
     return list(out.values())
 
