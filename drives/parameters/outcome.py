@@ -51,7 +51,8 @@ def what_is_held(
     holds: dict[str, str] = {}
     for axis, outcome in outcomes.items():
         record = journal.drive(axis)
-        names = {held.info.address: held.info.name for held in backups[axis].held}
+        part = backups[axis]
+        names = {held.info.address: held.info.name for held in (*part.held, *part.set_up)}
         names |= {entry.info.address: entry.info.name for entry in record.entries}
         for address, text in outcome.failed.items():
             holds[f"{outcome.place}, {names[address]}, {address}"] = text

@@ -132,7 +132,10 @@ def bring_set_up_back(
     for held in wanted:
         if not _holds(drive, held) and _matters(held, counts):
             address = held.info.address
-            failed[address] = refused.get(address, f"not as it was: {held.value}")
+            why = f" ({refused[address].rstrip('.')})" if address in refused else ""
+            now = _read(drive, held)
+            is_now = "not known" if now is None else str(now)
+            failed[address] = f"{is_now}, was {held.value}{why}"
     return tuple(h for h in differs if h.info.address not in failed), failed
 
 
@@ -166,10 +169,16 @@ def _pdo_of(held: HeldObject) -> int:
 
 
 def _holds(drive: ParameterDrive, held: HeldObject) -> bool:
+    value = _read(drive, held)
+    return value is not None and same(held.info, value, held.value)
+
+
+def _read(drive: ParameterDrive, held: HeldObject) -> int | float | str | None:
+    """Return what an object holds; None where the drive refuses to tell."""
     try:
-        return same(held.info, drive.read(held.info), held.value)
+        return drive.read(held.info)
     except SdoAbortError:
-        return False
+        return None
 
 
 def _matters(held: HeldObject, counts: dict[int, int | float | str]) -> bool:

@@ -329,9 +329,11 @@ class Transaction:
         kept = tuple(held for held in outcome.written if held.info.address not in again)
         outcome.written = (*kept, *done.written)
         outcome.failed = dict(done.failed)
-        entries = {entry.info.address for entry in self._record(axis).entries}
-        if entries & done.failed.keys():
-            raise MismatchError(f"{axis}: parameters of the write could not be brought back")
+        # What this tool had changed keeps the journal open, and is not stored as it is now.
+        changed = {entry.info.address for entry in self._record(axis).entries}
+        changed |= {held.info.address for held in self._backups[axis].set_up}
+        if changed & done.failed.keys():
+            raise MismatchError(f"{axis}: what the tool had changed could not be brought back")
 
     def _check_back(self, given_up: set[str]) -> None:
         """See that drives that were brought back first have not lost their supply since."""

@@ -9,7 +9,7 @@ from dataclasses import replace
 import pytest
 
 from drives.objects import ObjectAddress
-from drives.parameters import load_backup, save_backup
+from drives.parameters import load_backup, load_journal, save_backup
 from drives.sim.faults import Fault
 from drives.sim.host_faults import BusOff, HostKilled
 from fieldtool.writeback.unfinished import JournalKeeper
@@ -62,6 +62,37 @@ def test_a_motion_that_was_cut_off_is_taken_back_whole(tmp_path, monkeypatch, mo
         assert code == 0, said
         assert bench._all_changed() == {}
         assert not any(n.motion.powered for n in bench.machine.nodes)
+
+
+def test_a_restore_whose_pdos_are_refused_says_so_and_is_asked_for_again(tmp_path, monkeypatch):
+    """Which node holds what instead is said, and no session goes on until all is as it was."""
+    monkeypatch.setattr(JournalKeeper, "forget", lambda *_: None)
+    entry, fault = (0x1A00, 1), HostKilled()
+    with Bench(tmp_path, Moment.STILL, lambda _: (fault,)) as bench:
+        of_another_master(bench)
+        assert command("measure", bench.profile, "--yes", "--out", bench.out)[0] == 4
+        bench.machine.lift(fault)
+        guards = bench.machine.node(TABLE).dictionary.guards
+        own = guards.get(entry)
+        guards[entry] = lambda _: 0x08000022
+        now = bench.machine.node(TABLE).dictionary.read(*entry)
+        for _ in range(2):  # nothing is forgotten by asking
+            code, said = command("restore", bench.out)
+            assert code == 7, said
+            assert "table (node 11)" in said
+            assert f"0x1A00:01 holds {now}, was " in said
+            assert "arm (node 12) holds the old values" in said
+            assert load_journal(bench.out / "write-journal.yaml").is_open
+        code, said = command("measure", bench.profile, "--yes", "--out", tmp_path / "next")
+        assert code == 3, said
+        assert f"fieldtool restore {bench.out}" in said
+        if own is None:
+            del guards[entry]
+        else:
+            guards[entry] = own
+        code, said = command("restore", bench.out)
+        assert code == 0, said
+        assert bench._all_changed() == {}
 
 
 def test_a_check_that_lost_its_bus_leaves_what_restore_needs(tmp_path, monkeypatch):
