@@ -35,8 +35,9 @@ def uninterrupted() -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, signal.SIG_DFL if handler is None else handler)
-        if came and sys.exc_info()[0] is None:
-            signal.raise_signal(came[0])
-        elif came and callable(handler := before[came[0]]):
+        acting = [number for number in came if before[number] is not signal.SIG_IGN]
+        if acting and sys.exc_info()[0] is None:
+            signal.raise_signal(acting[0])
+        elif acting and callable(handler := before[acting[0]]):
             with suppress(BaseException):
-                handler(came[0], None)
+                handler(acting[0], None)

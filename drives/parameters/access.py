@@ -10,6 +10,11 @@ NOBODY = 0
 """User level of a drive that is locked."""
 
 
+def needs_password(drive: ParameterDrive) -> bool:
+    """Whether the drive's parameters are locked, as far as it tells."""
+    return drive.profile.unlock is not None and _level(drive) in (None, NOBODY)
+
+
 def unlock(drive: ParameterDrive) -> None:
     """Give the drive its password, where its profile says that it wants one; the drive forgets it.
 
@@ -21,7 +26,7 @@ def unlock(drive: ParameterDrive) -> None:
         If the drive does not answer.
     """
     how = drive.profile.unlock
-    if how is None or _level(drive) not in (None, NOBODY):
+    if how is None or not needs_password(drive):
         return
     password = drive.axis_profile.password
     if password is None:

@@ -144,6 +144,11 @@ def changes_back_to(drive: CanopenDrive, held: Mapping[ObjectAddress, Raw]) -> t
         Identified.
     held
         What objects held, in the drive's own units; only the parameters of its profile count.
+
+    Raises
+    ------
+    NotSupportedError
+        If one that would change may not be written, or is outside its range.
     """
     conversion = drive.conversion()
     changes = []
@@ -163,9 +168,18 @@ def changes_back_to(drive: CanopenDrive, held: Mapping[ObjectAddress, Raw]) -> t
         if parameter.object in held:
             unit = unit_on(drive.axis_profile.kind, parameter.unit) if known else "drive units"
             values = (old[name], new[name]) if known else (float(before), float(after))
-            changes.append(
-                Change(drive.axis, name, unit, _info(parameter, name), *values, before, after)
-            )
+            change = Change(drive.axis, name, unit, _info(parameter, name), *values, before, after)
+            changes.append(change)
+            if change.differs:
+                if drive.profile.gains_via in NOT_WRITTEN:
+                    why = NOT_WRITTEN[drive.profile.gains_via].format(profile=drive.profile.name)
+                    raise NotSupportedError(
+                        f"{drive.axis}: {why} Enter {name} with the maker's software. "
+                        "Nothing was written."
+                    )
+                _check_write_known(drive, name, parameter)
+                if known:
+                    _check_range(drive, name, parameter, change.after)
     return tuple(changes)
 
 
@@ -213,17 +227,32 @@ def _check_names(drive: CanopenDrive, held: Mapping[str, float]) -> None:
                 f"{drive.profile.name} says a parameter of {parameter.type}. Correct the profile. "
                 "Nothing was written."
             )
-        if name in held and parameter.write == UNKNOWN:
-            raise NotSupportedError(
-                f"{drive.axis}, {name}, object {parameter.object}: drive profile {drive.profile.name} "
-                "does not know in which state it may be written (`write`). Nothing was written."
-            )
+        if name in held:
+            _check_write_known(drive, name, parameter)
         moved = [other for other in parameter.times if other in held]
         if moved and name not in held:
             raise NotSupportedError(
                 f"{drive.axis}: writing {', '.join(moved)} would change {name} as well, because the "
                 "drive holds one by the other. Write them together. Nothing was written."
             )
+
+
+def _check_write_known(drive: CanopenDrive, name: str, parameter: ParameterInfo) -> None:
+    if parameter.write == UNKNOWN:
+        raise NotSupportedError(
+            f"{drive.axis}, {name}, object {parameter.object}: drive profile {drive.profile.name} "
+            "does not know in which state it may be written (`write`). Nothing was written."
+        )
+
+
+def _check_range(drive: CanopenDrive, name: str, parameter: ParameterInfo, value: float) -> None:
+    low, high = parameter.minimum, parameter.maximum
+    if (low is not None and value < low) or (high is not None and value > high):
+        unit = unit_on(drive.axis_profile.kind, parameter.unit)
+        raise NotSupportedError(
+            f"{drive.axis}, {name}: {value:g} {unit} is outside the drive's range "
+            f"{low} to {high} {unit}. Nothing was written."
+        )
 
 
 def _change(
@@ -242,12 +271,7 @@ def _change(
             f"{drive.axis}, {name}: {value} is no number that a drive can hold. Design the "
             "parameters again."
         )
-    low, high = parameter.minimum, parameter.maximum
-    if (low is not None and value < low) or (high is not None and value > high):
-        raise NotSupportedError(
-            f"{drive.axis}, {name}: {value:g} {unit} is outside the drive's range "
-            f"{low} to {high} {unit}. Nothing was written."
-        )
+    _check_range(drive, name, parameter, value)
     info = _info(parameter, name)
     try:
         held = info.decode(info.encode(conversion.raw(name, value, others)))

@@ -270,11 +270,21 @@ class Transaction:
         ------
         WriteBackMixedError
             If a value could not be restored or stored; every other one was.
+        UserStopError
+            If the user stopped meanwhile: everything was restored all the same.
         """
-        with uninterrupted():
-            self._save(self.journal)
-            self._back_again(self.journal, whole=True)
-            self._refuse_mixed("not everything could be restored", None)
+        done = False
+        try:
+            with uninterrupted():
+                self._save(self.journal)
+                self._back_again(self.journal, whole=True)
+                self._refuse_mixed("not everything could be restored", None)
+                done = True
+        except BaseException as error:
+            if done:  # a stop that was held back
+                but = f" but {', '.join(sorted(self._left_out))}" if self._left_out else ""
+                error.add_note(f"The restore had ended: all drives{but} hold the old values.")
+            raise
 
     def _back_again(self, journal: Journal, *, whole: bool) -> None:
         """Bring back until all drives hold their old values at the same time."""

@@ -135,7 +135,7 @@ def switch(
         )
     show_parameters(console, result, listed=ask.refused)
     if result.in_memory:
-        console.print(indented(f"`fieldtool restore {folder}` takes it back."))
+        console.print(indented(f"`fieldtool restore {result.backup}` takes it back."))
     if as_json:
         print_json(written_as_dict(folder, result))
     ask.end()

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from drives.canopen_drive import CanopenDrive
-from drives.errors import ProfileError
+from drives.errors import NotSupportedError, ProfileError, UserStopError
 from drives.parameters import (
     Action,
     Backup,
@@ -30,6 +30,7 @@ from drives.parameters import (
     load_backup,
     load_journal,
 )
+from drives.parameters.access import needs_password
 from drives.parameters.journal import Goal
 from fieldtool.writeback.earlier import FIRST_BACKUP, memory_seen_from
 from fieldtool.writeback.transaction import tell_storing
@@ -203,6 +204,13 @@ def bring_back(
             )
     taking_part = [by_axis[part.axis] for part in parts]
     check_disabled(taking_part)
+    for drive in taking_part:
+        if needs_password(drive) and drive.axis_profile.password is None:
+            raise NotSupportedError(
+                f"{drive.axis}: the drive's parameters are locked, and no password is known: a session "
+                "folder keeps none. Add `--machine FILE` with the machine profile that gives `password` "
+                "at this axis. Nothing was written."
+            )
     keeper = JournalKeeper(source.backup_path.with_name(JOURNAL))
     counts = {part.axis: len(part.held) for part in parts}
 
@@ -218,6 +226,9 @@ def bring_back(
             transaction.restore()
     except OSError as error:
         raise not_kept(keeper, error) from error
+    except (UserStopError, KeyboardInterrupt):
+        keeper.settle(transaction.journal)
+        raise
     keeper.settle(transaction.journal)
     if transaction.unsaved is not None:
         notes.append(

@@ -234,10 +234,18 @@ def _keep(
     tool = ToolSet(name, machine, kept, source, verified, figures, parameters, folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / "tool.yaml").unlink(missing_ok=True)  # never the old words about new values
-        save_backup(parameters, folder / "parameters.yaml")
-        beside = file_checksum(folder / "parameters.yaml")
-        write_tool_file(folder / "tool.yaml", ToolFile(**tool.as_dict(), parameters=beside))
+        # Both are on the disk before either takes its place: a full disk leaves the old set.  Cut off
+        # between the two, the checksum of the parameters tells that they do not belong together.
+        new = {name: folder / f"{name}.new" for name in ("parameters.yaml", "tool.yaml")}
+        try:
+            save_backup(parameters, new["parameters.yaml"])
+            beside = file_checksum(new["parameters.yaml"])
+            write_tool_file(new["tool.yaml"], ToolFile(**tool.as_dict(), parameters=beside))
+            for name_now, path in new.items():
+                path.replace(folder / name_now)
+        finally:
+            for path in new.values():
+                path.unlink(missing_ok=True)
     except OSError as error:
         raise OutputError(
             f"{folder}: the tool set can not be kept ({error.strerror or error}). Make room, or name "

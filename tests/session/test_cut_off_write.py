@@ -3,13 +3,15 @@
 import json
 import os
 import shutil
+import signal
+from importlib.resources import files
 from pathlib import Path
 
 import pytest
 import yaml
 
 from drives.canopen_drive import CanopenDrive, connect
-from drives.parameters import Memory, Phase, load_journal, save_journal
+from drives.parameters import Memory, Phase, Transaction, load_journal, save_journal
 from drives.parameters.backup import checksum
 from drives.profile import load_machine
 from drives.sim.faults import DriveFault, NodeVanishes
@@ -544,3 +546,40 @@ def test_a_lost_journal_makes_a_later_one_say_that_it_does_not_know(session):
     assert session.command("write", session.out, "--yes").code == 0
     told = told_memory(session.command("restore", session.out, "--json"))
     assert told == {"table": "unknown", "arm": "unknown"}
+
+
+def test_a_locked_drive_without_password_is_refused_before_anything_is_touched(session, cut_off):
+    """A session folder keeps no password; the sentence says how to give it."""
+    cut_off(PER_DRIVE + 2)
+    packaged = files("profiles") / "drives"
+    drive = yaml.safe_load((packaged / "reference.yaml").read_text())
+    (session.folder / "reference.eds").write_bytes((packaged / "reference.eds").read_bytes())
+    drive["unlock"] = {"object": "0x2000:01"}
+    (session.folder / "locked.yaml").write_text(yaml.safe_dump(drive, sort_keys=False))
+    for axis in session.data["axes"]:
+        axis["drive"] = "locked.yaml"
+    session.rewrite(session.data)
+    journal, held_then = (session.out / "write-journal.yaml").read_bytes(), session.objects()
+    outcome = session.command("restore", session.out, "--machine", session.profile)
+    assert outcome.code == 3, outcome.err
+    assert "--machine FILE" in in_one_line(outcome.err)
+    assert (session.out / "write-journal.yaml").read_bytes() == journal
+    assert session.objects() == held_then
+    assert session.command("restore", session.out).code == 0
+    assert session.changed() == {}
+
+
+def test_a_stop_while_all_is_brought_back_says_that_it_is(session, cut_off, monkeypatch):
+    cut_off(PER_DRIVE + 2)
+    again = Transaction._back_again
+
+    def pressed(one, *arguments, **options):
+        signal.raise_signal(signal.SIGINT)
+        again(one, *arguments, **options)
+
+    monkeypatch.setattr(Transaction, "_back_again", pressed)
+    outcome = session.command("restore", session.out)
+    assert outcome.code == 130, outcome.err
+    assert "all drives hold the old values" in in_one_line(outcome.err)
+    assert session.changed() == {}
+    assert notes() == []

@@ -3,6 +3,7 @@
 import json
 import shutil
 import signal
+from importlib.resources import files
 
 import pytest
 import yaml
@@ -334,3 +335,70 @@ def test_who_answers_no_gets_130_and_the_drives_as_they_were(
     assert "not written, as you answered" in outcome.err
     assert len(asked) == 1
     assert session.changed() == {}
+
+
+@pytest.mark.usefixtures("untried")
+def test_a_second_switch_in_the_same_folder_names_its_own_backup(session, tmp_path):
+    """What it prints brings back what was there before it, not before the first switch."""
+    tools(session, "keep", "bare")
+    session.command("write", session.out, "--yes")
+    tools(session, "keep", "gripper", "--from", session.out)
+    written, out = session.changed(), tmp_path / "one"
+    tools(session, "switch", "bare", "--yes", "--out", out)
+    for name, before in (("gripper", {}), ("bare", written)):
+        switched = tools(session, "switch", name, "--yes", "--out", out)
+        words = "".join(switched.out.split())
+        path = words.rpartition("`fieldtoolrestore")[2].partition("`takesitback")[0]
+        assert session.command("restore", path).code == 0, path
+        assert session.changed() == before
+        tools(session, "switch", name, "--yes", "--out", tmp_path / "other")
+
+
+@pytest.mark.usefixtures("untried")
+@pytest.mark.parametrize("how", ["unknown state", "read-only", "range"])
+def test_a_switch_writes_nothing_that_the_drive_profile_forbids(session, tmp_path, how):
+    """Where values differ; a set that changes nothing is no harm."""
+    tools(session, "keep", "bare")
+    session.command("write", session.out, "--yes")
+    written = session.changed()
+    packaged = files("profiles") / "drives"
+    drive = yaml.safe_load((packaged / "reference.yaml").read_text())
+    (session.folder / "reference.eds").write_bytes((packaged / "reference.eds").read_bytes())
+    one = drive["parameters"]["velocity_p"]
+    if how == "unknown state":
+        one["write"] = "unknown"
+    elif how == "read-only":
+        drive["gains_via"] = "read-only"
+    else:
+        one["minimum"] = 1.9
+    (session.folder / "own.yaml").write_text(yaml.safe_dump(drive, sort_keys=False))
+    for axis in session.data["axes"]:
+        axis["drive"] = "own.yaml"
+    session.rewrite(session.data)
+    outcome = tools(session, "switch", "bare", "--yes", "--out", tmp_path / "one")
+    assert outcome.code == 3, outcome.err
+    assert "Nothing was written" in outcome.err
+    assert session.changed() == written
+    assert session.command("restore", session.out).code == 0
+    assert session.changed() == {}
+    assert tools(session, "switch", "bare", "--yes", "--out", tmp_path / "two").code == 0
+
+
+@pytest.mark.usefixtures("untried")
+@pytest.mark.parametrize("full_at", ["parameters.yaml", "tool.yaml"])
+def test_a_full_disk_leaves_the_set_that_was_kept_before(session, monkeypatch, full_at):
+    tools(session, "keep", "bare")
+    before = json.loads(tools(session, "list", "--json").out)
+    files_before = sorted(tool_file("bare").parent.iterdir())
+    session.command("write", session.out, "--yes")
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    name = "save_backup" if full_at == "parameters.yaml" else "write_tool_file"
+    monkeypatch.setattr(f"fieldtool.writeback.tool_sets.{name}", full)
+    outcome = tools(session, "keep", "bare")
+    assert outcome.code != 0
+    assert "can not be kept" in outcome.err
+    assert json.loads(tools(session, "list", "--json").out) == before
+    assert sorted(tool_file("bare").parent.iterdir()) == files_before
