@@ -6,7 +6,7 @@ import numpy as np
 
 from drives.api import AxisLimits
 from drives.canopen_drive import CanopenDrive
-from drives.errors import DrivesError
+from drives.errors import DrivesError, UserStopError
 from drives.parameters import read_parameters
 from drives.profile import UNKNOWN
 from drives.profile.drive import CASCADE_PARAMETERS
@@ -55,6 +55,8 @@ def _why_not_told(drive: CanopenDrive) -> str:
         )
     try:
         told = drive.conversion().as_cascade(read_parameters(drive))
+    except UserStopError:
+        raise
     except DrivesError as error:
         return str(error)
     lacking = [name for name in CASCADE_PARAMETERS if name not in told]

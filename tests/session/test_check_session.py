@@ -235,6 +235,23 @@ def test_the_users_stop_is_130_and_safe(small_bench, monkeypatch) -> None:
     assert small_bench.changed() == {}
 
 
+def test_ctrl_c_while_a_drive_is_read_is_no_finding(small_bench, monkeypatch) -> None:
+    import signal
+
+    from drives.canopen_drive import CanopenDrive
+
+    check_mode = CanopenDrive.check_mode
+
+    def pressing(drive, mode) -> None:
+        signal.raise_signal(signal.SIGINT)
+        check_mode(drive, mode)
+
+    monkeypatch.setattr(CanopenDrive, "check_mode", pressing)
+    outcome = small_bench.command("check", small_bench.profile)
+    assert outcome.code == 130, outcome.out
+    assert "stopped by the user" in outcome.err
+
+
 def test_a_check_can_be_traced(small_bench) -> None:
     trace = small_bench.folder / "check.asc"
     outcome = small_bench.command("check", small_bench.profile, "--move", "--trace-file", trace)

@@ -5,7 +5,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from drives.errors import BusError, DrivesError, NodeAbsentError
+from drives.errors import BusError, DrivesError, NodeAbsentError, UserStopError
 
 Status = Literal["pass", "warn", "fail", "not tried"]
 WORST: tuple[Status, ...] = ("fail", "warn", "not tried", "pass")
@@ -70,11 +70,13 @@ class Findings:
         ------
         BusError
             If the bus is gone: then nothing else can be checked either.
+        UserStopError
+            If the user asked to stop.
         """
         went: list[bool] = []
         try:
             yield went
-        except BusError:
+        except (BusError, UserStopError):
             raise
         except DrivesError as error:
             absent = isinstance(error, NodeAbsentError)
