@@ -27,6 +27,8 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 
 STOPPED_AT_REST = "stopped by the user; no axis was moving, all are disabled."
+MAY_BE_ENABLED = "MAY STILL BE ENABLED"
+"""In every sentence of a drive that may not have taken the command to switch off."""
 LONGEST = 1000
 """Characters of a message about a profile."""
 

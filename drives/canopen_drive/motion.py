@@ -25,6 +25,7 @@ from drives.canopen_drive.sync import HostSync, Sync
 from drives.canopen_drive.unseen import Learned
 from drives.cia402 import ENABLED_VALUE, STEP_TOWARDS_ENABLED, Controlword, Mode, PowerState
 from drives.errors import (
+    MAY_BE_ENABLED,
     DriveFaultError,
     DrivesError,
     OscillationError,
@@ -332,22 +333,28 @@ class CanopenMotion:
 
         Axes that a ``SafetyStopError`` names in ``power_off`` are not ramped down: their power is cut.
         """
-        if self._stopped:
-            return
         with uninterrupted():
-            self._stopped = True
-            for channel in self._channels:
-                channel.hold = None  # from now on the target is where the axis is
-            cut = self._without_quick_stop(cause)
-            self._or_last_resort(lambda: self._quick_stop(cut))
-            self._make_sure_off()
-            if isinstance(cause, SafetyStopError) and cause.held_up:
-                for channel in self._channels:
-                    channel.drive.learned = Learned()  # the mean of half a move is no weight
+            if not self._stopped:
+                self._stop(cause)
             if cause is not None:
-                for sentence in self.perhaps_enabled.values():
-                    cause.add_note(sentence)
-                self._explain(cause)
+                for (
+                    sentence
+                ) in self.perhaps_enabled.values():  # also to what followed the first error
+                    if sentence not in getattr(cause, "__notes__", ()):
+                        cause.add_note(sentence)
+
+    def _stop(self, cause: BaseException | None) -> None:
+        self._stopped = True
+        for channel in self._channels:
+            channel.hold = None  # from now on the target is where the axis is
+        cut = self._without_quick_stop(cause)
+        self._or_last_resort(lambda: self._quick_stop(cut))
+        self._make_sure_off()
+        if isinstance(cause, SafetyStopError) and cause.held_up:
+            for channel in self._channels:
+                channel.drive.learned = Learned()  # the mean of half a move is no weight
+        if cause is not None:
+            self._explain(cause)
 
     def _without_quick_stop(self, cause: BaseException | None) -> frozenset[str]:
         """Return the axes whose power is cut at once: a quick stop needs loops that can be trusted."""
@@ -373,7 +380,7 @@ class CanopenMotion:
                 shown = "does not answer" if state is None else f"shows statusword 0x{state:04X}"
                 self.perhaps_enabled[drive.axis] = (
                     f"{drive.axis}: node {drive.node_id} {shown} after it was told to switch off: it "
-                    "MAY STILL BE ENABLED. It has to stop by itself within "
+                    f"{MAY_BE_ENABLED}. It has to stop by itself within "
                     f"{self._lost_after:g} s, as it misses the host's heartbeat. Use the emergency "
                     "stop before you go near it."
                 )

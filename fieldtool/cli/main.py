@@ -33,6 +33,7 @@ import typer
 from threadpoolctl import threadpool_limits
 
 from drives.errors import (
+    MAY_BE_ENABLED,
     BusError,
     DrivesError,
     NothingMovedError,
@@ -134,11 +135,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
         with threadpool_limits(limits=1):
             app(args=None if arguments is None else list(arguments))
     except (FieldtoolError, DrivesError) as error:
-        for text in (error, *dict.fromkeys(getattr(error, "__notes__", ()))):
-            _tell(f"{text}")
+        _tell(f"{error}")
+        _tell_notes(error)
         sys.exit(exit_code(error))
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as error:
         _tell("stopped by the user")
+        _tell_notes(error)
         sys.exit(130)
     except OSError as error:
         known = NAMED_BADLY | NO_ROOM if error.filename is not None else {ENOSPC}
@@ -147,18 +149,35 @@ def main(arguments: Sequence[str] | None = None) -> None:
         where = "the output" if error.filename is None else str(error.filename)
         drop_output()
         _tell(f"{where[:LONGEST_NAME]}: {error.strerror}")
+        _tell_notes(error)
         sys.exit(2 if error.errno in NAMED_BADLY else 3)
     except Exception as error:  # a defect of the tool: still one sentence, and nothing lost
         _defect(error)
 
 
 def _defect(error: Exception) -> NoReturn:
-    """Say that the tool has a defect, and keep its details."""
+    """Say what is known of the machine, that the tool has a defect, and keep its details."""
+    _tell_notes(error)
+    stopped = (
+        "Axes were told to stop, not all have said that they did: see above."
+        if any(MAY_BE_ENABLED in note for note in _notes(error))
+        else "If axes were moving, they were stopped."
+    )
     _tell(
-        f"unexpected {type(error).__name__}: {error}. If axes were moving, they were stopped. "
+        f"unexpected {type(error).__name__}: {error}. {stopped} "
         f"This is a defect of fieldtool; please report it{_kept(traceback.format_exc())}"
     )
     sys.exit(1)
+
+
+def _notes(error: BaseException) -> tuple[str, ...]:
+    """Return what is to be said besides an error, each sentence once."""
+    return tuple(dict.fromkeys(getattr(error, "__notes__", ())))
+
+
+def _tell_notes(error: BaseException) -> None:
+    for note in _notes(error):
+        _tell(note)
 
 
 def _tell(sentence: str) -> None:

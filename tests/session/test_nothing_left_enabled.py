@@ -4,7 +4,7 @@ import can
 import numpy as np
 import pytest
 
-from drives.errors import NothingMovedError, SafetyStopError
+from drives.errors import BusError, NothingMovedError, SafetyStopError
 from drives.sim.faults import SdoRefused, SdoSilent
 from fieldtool.workflow.session import never, open_session
 
@@ -70,6 +70,25 @@ def test_a_drive_that_can_not_be_switched_off_keeps_its_fail_safe(bench):
     with bench.connected() as again:  # time passes, and no heartbeat comes
         again.line.wait(1.0)
     assert bench.powered() == {}
+
+
+def test_an_error_that_becomes_a_stop_keeps_the_warning(bench):
+    """The error that leaves is another one than the one that stopped the axes."""
+    bench.inject(SdoSilent(TABLE, 0x6040, 0))
+    with (
+        bench.connected() as group,
+        pytest.raises(SafetyStopError, match="is gone") as stop,
+        group.motion(0.002) as motion,
+    ):
+
+        def source(before):
+            if before is None:
+                return np.tile(motion.position, (50, 1))
+            bench.machine.receive(0x000, bytes([0x80, TABLE]))
+            raise BusError("the bus is gone")
+
+        motion.stream(source)
+    assert "MAY STILL BE ENABLED" in " ".join(getattr(stop.value, "__notes__", []))
 
 
 def test_the_last_target_stays_the_target_while_the_axis_is_switched_off(bench):

@@ -117,6 +117,32 @@ def test_what_the_operating_system_refuses_is_said(monkeypatch, capsys, error, c
     assert said in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    "error",
+    [
+        ValueError("so"),
+        OSError(errno.EBADF, "Bad file descriptor"),
+        OSError(errno.EROFS, "Read-only file system", "a/b"),
+        KeyboardInterrupt(),
+    ],
+)
+def test_what_is_noted_of_the_machine_is_said_whatever_ended_the_command(
+    monkeypatch, capsys, error
+):
+    def fails(**_: object) -> None:
+        error.add_note("table: it MAY STILL BE ENABLED. Use the emergency stop.")
+        raise error
+
+    cli = import_module("fieldtool.cli.main")
+    monkeypatch.setattr(cli, "app", fails)
+    monkeypatch.setattr(cli, "drop_output", lambda: None)
+    with pytest.raises(SystemExit):
+        main([])
+    said = capsys.readouterr().err
+    assert said.count("fieldtool: table: it MAY STILL BE ENABLED. Use the emergency stop.") == 1
+    assert "they were stopped" not in said
+
+
 def test_no_answer_at_all_is_a_no(monkeypatch, capsys):
     monkeypatch.setattr("sys.stdin", io.StringIO(""))
     assert not confirmed("Move the machine now?")
