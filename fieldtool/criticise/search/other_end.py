@@ -50,7 +50,6 @@ def at_other_end(fitted: Hypothesis) -> Hypothesis | None:
         (masses, springs), mass, stiffness = chains[k], shares[k], shares[k] * rates[k]
     base = fitted.base.copy()
     base[places[0]], base[places[1]] = masses, springs
-    base = fitted.machine.clipped(base)
     if not (mass > 0.0 and stiffness > 0.0 and fitted.machine.physical(base)):
         return None
     frequency = float(np.sqrt(stiffness / mass) / (2 * np.pi))
