@@ -117,7 +117,7 @@ def wait_for_standstill(group: CanopenGroup) -> None:
         if still >= 2:
             return
     raise PlanRefusedError(
-        f"{', '.join(moved)}: moves although its drive is disabled. Nothing was moved or written. Does "
+        f"{', '.join(moved)}: moves although its drive is disabled. Does "
         "its brake close, does something push it, or does its encoder drift?"
     )
 

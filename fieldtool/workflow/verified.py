@@ -7,7 +7,7 @@ from drives.parameters import Change
 from fieldtool.design.verdict import Comparison
 
 FORMAT = "fieldtool-verification/1"
-Verdict = Literal["verified", "restored", "not tried"]
+Verdict = Literal["verified", "restored", "mixed"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -16,7 +16,7 @@ class Verified:
 
     verdict: Verdict
     reasons: tuple[str, ...]
-    """Why the old parameters were restored; empty where they were not."""
+    """Why the old parameters were to be restored; empty where the new ones are kept."""
     axes: tuple[Comparison, ...]
     parameters: tuple[Change, ...]
     """What was tried: new parameters, and the old ones that they took the place of."""
@@ -34,6 +34,8 @@ class Verified:
         """What came of it, for a person."""
         if self.verdict == "verified":
             return "The new parameters stood their trial on the machine."
+        if self.verdict == "mixed":
+            return f"Not all drives are known to hold their old parameters again: {'; '.join(self.reasons)}"
         return f"The new parameters were taken back: {'; '.join(self.reasons)}"
 
     def as_dict(self) -> dict[str, Any]:

@@ -21,13 +21,18 @@ from drives.errors import (
     SafetyStopError,
     StoppedError,
     UserStopError,
-    WriteBackMixedError,
 )
 from drives.parameters import Change
+from drives.parameters.journal import State
 from fieldtool.design.servo import Servo
 from fieldtool.design.tuning import SOFTEST, Tuning, why_not_stored
 from fieldtool.design.verdict import Comparison, doubts, faults
-from fieldtool.errors import IdentificationError, OutputError
+from fieldtool.errors import (
+    FieldtoolError,
+    IdentificationError,
+    OutputError,
+    PlanRefusedError,
+)
 from fieldtool.experiment.axes import Axes, torque_limits
 from fieldtool.experiment.verification.oscillation import HOLD_LEVEL, LOUDEST
 from fieldtool.experiment.verification.trial import Tried, run_trial, still_allowed
@@ -53,7 +58,7 @@ from fieldtool.workflow.trial_plan import (
     wait_for_standstill,
 )
 from fieldtool.workflow.trial_records import TrialRecords
-from fieldtool.workflow.verified import Verified
+from fieldtool.workflow.verified import Verdict, Verified
 from fieldtool.writeback.temporary import backed_up
 
 TRIALS = 3
@@ -115,7 +120,10 @@ class Verification:
             If the new parameters are not stable by the model, or nothing may move.
         """
         self._changes = tuple(changes)
-        wait_for_standstill(self._group)
+        try:
+            wait_for_standstill(self._group)
+        except PlanRefusedError as error:
+            raise PlanRefusedError(f"{error} Nothing was moved or written.") from None
         designed = self._tuning.prediction if self._believed else None
         self._plan = plan_trial(
             self._group, self._setting, changes, self._bound, self._stated, designed
@@ -165,7 +173,6 @@ class Verification:
         self._session.screen.stage(
             "Try the new parameters: hold still, small moves, small excitation"
         )
-        self._forget_earlier()
         tried: Tried | None = None
         reasons: tuple[str, ...] = ("the trial was cut short",)
         try:
@@ -176,7 +183,7 @@ class Verification:
         except UserStopError:
             reasons = ("the user stopped the trial",)
             raise
-        except (StoppedError, IdentificationError) as error:
+        except (StoppedError, FieldtoolError) as error:
             reasons = (str(error),)
             failed = NotVerifiedError(f"the new parameters do not stand their trial: {error}")
             for note in getattr(error, "__notes__", ()):
@@ -189,14 +196,6 @@ class Verification:
             raise NotVerifiedError(
                 f"the new parameters do not stand their trial: {'; '.join(reasons)}"
             )
-
-    def _forget_earlier(self) -> None:
-        """Remove the verdict of a write before: the drives do not hold those values any more."""
-        path = self._session.folder.verification
-        try:
-            path.unlink(missing_ok=True)
-        except OSError as error:
-            raise OutputError(f"{path}: can not be removed ({error.strerror})") from error
 
     @property
     def _records(self) -> TrialRecords:
@@ -251,7 +250,7 @@ class Verification:
             now = [drive.read_position() for drive in self._group.drives]
         except UserStopError:
             raise
-        except (DrivesError, IdentificationError) as error:
+        except (DrivesError, FieldtoolError) as error:
             return str(error)
         self._heed_stop()
         if name == "before":
@@ -374,23 +373,26 @@ class Verification:
         for text in doubtful:
             self._session.warn(text)
 
-    def ended(self, error: BaseException | None) -> None:
-        """Keep what came of it, once the write has ended: ``verified`` only if it ended well.
+    def ended(self, error: BaseException | None, held: State) -> None:
+        """Keep what came of it, once the write has ended: ``verified`` only if the new values are held.
 
         Neither a disk that is full nor a picture that can not be drawn hides it.
 
         Parameters
         ----------
         error
-            What took the write back, or kept it from beginning; None if the drives hold the new values.
+            What took the write back, or came when it had ended; None: nothing.
+        held
+            What the drives hold by the write's journal.
         """
         if self.result is None:
             return
-        if error is not None:
-            reasons = self.result.reasons or (str(error) or type(error).__name__,)
-            if isinstance(error, WriteBackMixedError) and str(error) not in reasons:
-                reasons = (*reasons, str(error))
-            self.result = replace(self.result, verdict="restored", reasons=reasons)
+        if held is not State.NEW:
+            reasons = self.result.reasons
+            if error is not None and (not reasons or held is State.OPEN):
+                reasons = (*reasons, str(error) or type(error).__name__)
+            verdict: Verdict = "mixed" if held is State.OPEN else "restored"
+            self.result = replace(self.result, verdict=verdict, reasons=reasons)
         folder = self._session.folder
         folder.note("verified", verdict=self.result.verdict, reasons=list(self.result.reasons))
         try:

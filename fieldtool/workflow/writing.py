@@ -3,10 +3,11 @@
 from collections.abc import Callable, Sequence
 
 from drives.canopen_drive import CanopenGroup
-from drives.errors import NotSupportedError, UserStopError
-from drives.parameters import Change
+from drives.errors import NotSupportedError, ProfileError, UserStopError
+from drives.parameters import Change, load_journal
+from drives.parameters.journal import State
 from fieldtool.design.tuning import Tuning
-from fieldtool.errors import PlanRefusedError
+from fieldtool.errors import OutputError, PlanRefusedError
 from fieldtool.records.model import MachineModel
 from fieldtool.workflow.session import Options, Session, parameter_table
 from fieldtool.workflow.verified import Verified
@@ -94,6 +95,7 @@ def written(
             if ask_to_move and not session.ready():
                 raise UserStopError("not begun: nothing was moved or written")
             verification.before()
+        _forget_earlier(session)
         session.screen.stage("Write the new parameters, and read them back")
         return True
 
@@ -111,12 +113,31 @@ def written(
         )
     except BaseException as error:
         if verification is not None:
-            verification.ended(error)
+            verification.ended(error, _held_after(session))
         raise
     if verification is not None:
-        verification.ended(None)
+        verification.ended(None, State.NEW if result.in_memory else State.OLD)
     session.folder.note("parameters", rows=parameter_table(result))
     session.folder.note("write", written=result.in_memory, stored=result.stored)
     if result.in_memory and verification is None:
         session.warn("The new parameters were not tried on the machine (--no-verify).")
     return result, verification.result if verification else None
+
+
+def _forget_earlier(session: Session) -> None:
+    """Remove the verdict of a write before: from now on the drives do not hold those values."""
+    path = session.folder.verification
+    try:
+        path.unlink(missing_ok=True)
+    except OSError as error:
+        raise OutputError(
+            f"{path}: can not be removed ({error.strerror}). Nothing was written."
+        ) from error
+
+
+def _held_after(session: Session) -> State:
+    """Return what the drives hold by the journal of a write that an error has ended."""
+    try:
+        return load_journal(session.folder.journal).state
+    except (ProfileError, OSError):
+        return State.OPEN  # what can not be read is not known to have ended
