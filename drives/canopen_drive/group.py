@@ -93,6 +93,20 @@ class CanopenGroup:
         """
         return tuple(not obstacle for obstacle in self._offset_obstacles)
 
+    def check_can_measure(self) -> None:
+        """Refuse drives that frequency responses can not be measured with, before anything moves.
+
+        Raises
+        ------
+        NotSupportedError
+            If a drive lacks a mode that measuring needs, or is not known to stop by itself.
+        """
+        for drive in self._drives:
+            drive.check_mode(Mode.CYCLIC_POSITION)
+            fail_safe.require_fail_safe(drive)
+            if drive.axis_profile.may_float and len(self._drives) > 1:
+                drive.check_mode(Mode.CYCLIC_TORQUE)
+
     @contextmanager
     def without_feed_forward(self) -> Iterator[None]:
         """Switch the drives' feed-forward off while frequency responses are measured.
@@ -109,11 +123,7 @@ class CanopenGroup:
         SdoError, NotSupportedError
             If a drive does not take it; then those before have their old values again.
         """
-        for drive in self._drives:
-            drive.check_mode(Mode.CYCLIC_POSITION)
-            fail_safe.require_fail_safe(drive)
-            if drive.axis_profile.may_float and len(self._drives) > 1:
-                drive.check_mode(Mode.CYCLIC_TORQUE)
+        self.check_can_measure()
         with ExitStack() as stack:
             for drive in self._drives:
                 changes = self._changes(stack, drive)

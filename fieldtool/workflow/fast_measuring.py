@@ -44,6 +44,7 @@ from fieldtool.workflow.preparation import (
     recording_header,
     setting_of,
     window_notes,
+    without_feed_forward,
 )
 from fieldtool.workflow.rescued import keeping
 from fieldtool.workflow.session import Options, Screen, Session
@@ -74,7 +75,7 @@ def plan(
     *,
     screen: Screen | None = None,
 ) -> PlannedFast:
-    """Plan a fast measurement of a machine, with its drives' gains; nothing moves.
+    """Plan a fast measurement of a machine, with its drives' gains; nothing moves or is written.
 
     Raises
     ------
@@ -83,8 +84,11 @@ def plan(
     """
     profile = machine if isinstance(machine, MachineProfile) else load_machine(machine)
     options = options or Options()
-    with connected(profile) as group, group.without_feed_forward():
+    with connected(profile) as group:
+        group.check_can_measure()
         setting = setting_of(profile, group, prior_model(profile))
+        bare = tuple(map(without_feed_forward, group.drives, setting.loops))
+        setting = replace(setting, loops=bare)
         cycle_time = fast_cycle_times(setting.model, group.shortest_cycle)[0]
         times = timing(setting, options.excitation_time or usual_seconds(setting.model))
         planned, _ = planned_before(

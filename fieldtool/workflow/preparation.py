@@ -36,6 +36,16 @@ def setting_of(machine: MachineProfile, group: CanopenGroup, model: MachineModel
     )
 
 
+def without_feed_forward(drive: CanopenDrive, loop: AxisLoop) -> AxisLoop:
+    """Return a drive's loop with that feed-forward off that can be switched off."""
+    switched = drive.profile.feed_forward
+    return replace(
+        loop,
+        velocity_ff=0.0 if "velocity_ff" in switched else loop.velocity_ff,
+        inertia_ff=0.0 if "inertia_ff" in switched else loop.inertia_ff,
+    )
+
+
 def _within_window(drive: CanopenDrive, loop: AxisLoop) -> AxisLimits:
     """Limits of an axis within the drive's own window, feed-forward off: the error grows with speed."""
     limits, window = drive.limits, following_error_window(drive)

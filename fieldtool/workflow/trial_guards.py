@@ -13,8 +13,8 @@ from fieldtool.experiment.verification.learned import LEAST_SEEN, Learned
 from fieldtool.experiment.verification.trial import Tried
 from fieldtool.experiment.verification.watch import Guards
 from fieldtool.experiment.verification.work import WorkRecord, WorkWatch
+from fieldtool.workflow.preparation import without_feed_forward
 from fieldtool.workflow.trial_loops import drive_loop
-from fieldtool.workflow.trial_plan import without_feed_forward
 
 MOST_MISSING = 10.0
 """Times the usual that work may be missing with the old parameters; beyond it a person is told."""
@@ -79,7 +79,7 @@ class TrialGuards:
         """Go on with controllers whose feed-forward is switched off, where it can be."""
         if self._identity is not None:
             pairs = zip(self._group.drives, servos, strict=True)
-            bare = ((d, replace(s, loop=without_feed_forward(d, s))) for d, s in pairs)
+            bare = ((d, replace(s, loop=without_feed_forward(d, s.loop))) for d, s in pairs)
             self._identity.use([drive_loop(*pair) for pair in bare])
 
     def learn(self) -> None:

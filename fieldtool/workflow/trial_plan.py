@@ -22,10 +22,9 @@ from fieldtool.experiment.verification.excitation import (
     sensitivity_plan,
 )
 from fieldtool.experiment.verification.trial import Trial
-from fieldtool.records.closed_loop import AxisLoop
 from fieldtool.records.model import FloatArray
 from fieldtool.workflow.design_inputs import moves_of, timing_of
-from fieldtool.workflow.preparation import check_seen
+from fieldtool.workflow.preparation import check_seen, without_feed_forward
 from fieldtool.workflow.trial_checks import (
     check_a_count,
     check_as_designed,
@@ -257,16 +256,6 @@ def _answer(
     return answer, answer_torque(loops, answer, cycle)
 
 
-def without_feed_forward(drive: CanopenDrive, servo: Servo) -> AxisLoop:
-    """Return a drive's loop with that feed-forward off that can be switched off."""
-    loop, switched = servo.loop, drive.profile.feed_forward
-    return replace(
-        loop,
-        velocity_ff=0.0 if "velocity_ff" in switched else loop.velocity_ff,
-        inertia_ff=0.0 if "inertia_ff" in switched else loop.inertia_ff,
-    )
-
-
 def _with_excitation(
     plan: TrialPlan, group: CanopenGroup, setting: Setting, steps: Sequence[float]
 ) -> TrialPlan:
@@ -291,7 +280,8 @@ def _with_excitation(
     ]
     at = np.array([drive.read_position() for drive in group.drives])
     loops = [
-        tuple(map(without_feed_forward, group.drives, servos)) for servos in (plan.old, plan.new)
+        tuple(without_feed_forward(d, s.loop) for d, s in zip(group.drives, servos, strict=True))
+        for servos in (plan.old, plan.new)
     ]
     here = [replace(setting, loops=own, centre=at) for own in loops]
     try:

@@ -35,7 +35,7 @@ class Verified:
         if self.verdict == "verified":
             return "The new parameters stood their trial on the machine."
         if self.verdict == "mixed":
-            return f"Not all drives are known to hold their old parameters again: {'; '.join(self.reasons)}"
+            return f"Not all drives are known to hold their old values again: {'; '.join(self.reasons)}"
         return f"The new parameters were taken back: {'; '.join(self.reasons)}"
 
     def as_dict(self) -> dict[str, Any]:

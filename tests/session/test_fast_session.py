@@ -9,8 +9,11 @@ import numpy as np
 import pytest
 import yaml
 
+from drives.profile import load_machine
 from drives.sim.faults import DriveFault, Fault
 from fieldtool.workflow import fast_measuring
+from fieldtool.workflow.models import prior_model
+from fieldtool.workflow.preparation import setting_of, without_feed_forward
 
 TABLE, ARM = 11, 12
 INTO = (900, 3000)
@@ -81,9 +84,26 @@ def test_plan_only_moves_nothing(make_bench):
         assert words in outcome.out
     assert frames, "the drives' gains were read"
     assert enabling_words(frames) == []
+    assert [f for f in frames if f.cob_id & 0x780 == 0x600 and f.data[0] >> 5 == 1] == [], (
+        "a download"
+    )
     assert bench.machine.sync_count == 0
     assert bench.changed() == {}
     assert not bench.out.exists()
+
+
+def test_a_plan_alone_is_made_as_if_feed_forward_were_off(make_bench):
+    """The run that follows switches it off; a plan alone does not touch it, and says the same."""
+    bench = make_bench(turntable())
+    with bench.connected() as group:
+        machine = load_machine(bench.profile)
+        model = prior_model(machine)
+        held = setting_of(machine, group, model).loops
+        planned = [without_feed_forward(*pair) for pair in zip(group.drives, held, strict=True)]
+        with group.without_feed_forward():
+            met = setting_of(machine, group, model).loops
+    assert any(loop.velocity_ff for loop in held)
+    assert planned == list(met)
 
 
 def test_too_little_time_is_extended_and_said(make_bench):
