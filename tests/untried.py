@@ -5,6 +5,8 @@ The trial itself has tests of its own; here it would only move axes for half a m
 
 from typing import Any
 
+from drives.parameters.journal import State
+
 
 class Stood:
     """A verification that tries nothing."""
@@ -24,7 +26,7 @@ class Stood:
     def prove(self) -> None:
         """Find nothing wrong."""
 
-    def ended(self, _error: BaseException | None) -> None:
+    def ended(self, _error: BaseException | None, _held: State) -> None:
         """Keep nothing."""
 
 
