@@ -193,6 +193,6 @@ def test_without_the_password_nothing_is_restored_and_it_is_said(tmp_path):
         with connect(machine, to_move=False) as group:
             save_backup(back_up(machine.name, group.drives), path)
         node.dictionary.force(0x2030, 0, 7.0)
-        with pytest.raises(DrivesError, match="Give `password` at the axis"):
+        with pytest.raises(DrivesError, match=r"no password is known.*`--machine FILE`"):
             workflow.restore(machine.path, path)
         assert node.dictionary.read(0x2030, 0) == 7.0
