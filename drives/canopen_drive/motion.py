@@ -337,9 +337,8 @@ class CanopenMotion:
             if not self._stopped:
                 self._stop(cause)
             if cause is not None:
-                for (
-                    sentence
-                ) in self.perhaps_enabled.values():  # also to what followed the first error
+                # Also to an error that followed the one that stopped the axes.
+                for sentence in self.perhaps_enabled.values():
                     if sentence not in getattr(cause, "__notes__", ()):
                         cause.add_note(sentence)
 
