@@ -13,6 +13,7 @@ moved.  Cycles that are missing now and then, or late, are bridged: of what happ
 sure counts.  All in position units, torque units and cycles.
 """
 
+import math
 from collections import deque
 from dataclasses import dataclass
 from statistics import median
@@ -268,11 +269,13 @@ class Unseen:
                 self.alarm = "dead"
             return
         hold = FRICTION_SHARE * friction + self._floor + self._disturbed
-        if abs(pushed) > hold:
-            self._speed += push * (pushed - hold if pushed > 0 else pushed + hold)
-        else:  # it may have been caught again
-            left = max(0.0, abs(self._speed) - push * hold)
-            self._speed = left if self._speed > 0 else -left
+        if not self._speed:
+            self._speed = push * (pushed - math.copysign(min(abs(pushed), hold), pushed))
+        else:  # it moves, and friction takes no more of its speed than it holds it by
+            direction = math.copysign(1.0, self._speed)
+            self._speed += push * (pushed - direction * hold)
+            if direction * self._speed < 0:  # it is caught again
+                self._speed = 0.0
         self.way += self._speed * cycles
         if self.knows and abs(self.way) > self.at_rest:
             self.alarm = "pushed"

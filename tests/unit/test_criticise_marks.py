@@ -53,7 +53,11 @@ def _started(prepared):
 
 
 def test_only_the_cause_shows_its_own_mark(fresh_rng):
-    """A delay or a lag, looked at as either."""
+    """A delay or a lag, looked at as either.
+
+    Looked at as what it is not, more than noise is left, and the number beside it may be anything: it
+    is not sure.  Looked at as what it is, it is near 0.
+    """
     time = float(fresh_rng.integers(8, 14)) * STEP / FINE
     kinds = ("measurement_delay", "torque_lag")
     truth = str(fresh_rng.choice(kinds))
@@ -62,7 +66,8 @@ def test_only_the_cause_shows_its_own_mark(fresh_rng):
     for kind, other in (kinds, kinds[::-1]):
         reading = read(recording, kind, other)
         assert reading.shown != ("its relative's" if kind == truth else "its own"), (truth, reading)
-        assert (reading.number < 0.5) == (kind == truth), (truth, reading)
+        assert kind != truth or abs(reading.number) < 0.5, (truth, reading)
+        assert kind == truth or not reading.sure or reading.number > 0.5, (truth, reading)
 
 
 @pytest.mark.parametrize(
