@@ -16,7 +16,7 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 import can
 from can.interfaces import BACKENDS
 
-from drives.errors import BusError
+from drives.errors import BusError, UserStopError
 
 for _logger in ("can", "seeedbus"):  # what goes wrong is raised, not logged
     logging.getLogger(_logger).setLevel(logging.CRITICAL)
@@ -98,6 +98,8 @@ def bus_class(interface: str) -> type[can.BusABC]:
     module, name = BACKENDS[interface]
     try:
         found: type[can.BusABC] = getattr(importlib.import_module(module), name)
+    except UserStopError:
+        raise
     except Exception as error:  # an interface's module raises whatever its libraries do
         raise BusError(
             f"interface {interface} can not be used on this computer: {_plain(error)}. "
@@ -153,6 +155,8 @@ def known_options(interface: str) -> dict[str, tuple[type, ...]]:
 def _hints(cls: type) -> dict[str, Any]:
     try:
         return get_type_hints(vars(cls)["__init__"])
+    except UserStopError:
+        raise
     except Exception:  # a name of a library that is not there
         return {}
 

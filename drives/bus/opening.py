@@ -11,7 +11,7 @@ from drives.bus.adapters import (
     missing_package,
 )
 from drives.bus.kernel_link import KernelLink, kernel_links
-from drives.errors import BusError, ProfileError
+from drives.errors import BusError, ProfileError, UserStopError
 from drives.profile import BusProfile
 
 SOCKETCAN = "socketcan"
@@ -47,7 +47,7 @@ def open_bus(profile: BusProfile) -> can.BusABC:
     where = () if profile.channel is None else (profile.channel,)
     try:
         opened: can.BusABC = kind(*where, bitrate=profile.bitrate, **profile.options)
-    except BusError:
+    except (BusError, UserStopError):
         raise
     except Exception as error:  # adapters' libraries raise whatever they like
         cause = error.__cause__

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import can
 
 from drives.bus.kernel_link import kernel_links
+from drives.errors import UserStopError
 
 _TIMEOUT, _CONTROLLER, _PROTOCOL = 0x001, 0x004, 0x008
 _TRANSCEIVER, _NO_ACK, _BUS_OFF, _BUS_ERROR, _RESTARTED = 0x010, 0x020, 0x040, 0x080, 0x100
@@ -79,6 +80,8 @@ def bus_state(bus: can.BusABC) -> str:
         return states[0] or "" if states else ""
     try:
         state = bus.state
+    except UserStopError:
+        raise
     except Exception:  # many adapters do not tell, each in its own way
         return ""
     words = {can.BusState.PASSIVE: "error passive", can.BusState.ERROR: "off the bus or in error"}

@@ -19,6 +19,7 @@ from drives.canopen_drive.scaling import Scaled, read_scaling
 from drives.canopen_drive.unseen import Learned
 from drives.cia402 import Mode, PowerState, emergency_text, in_words
 from drives.errors import (
+    BusError,
     DriveFaultError,
     DrivesError,
     LimitsError,
@@ -313,7 +314,7 @@ class CanopenDrive:
             self.read(objects.DEVICE_TYPE)
         except SdoAbortError:
             return True
-        except DrivesError:
+        except (SdoError, BusError):
             return False
         return True
 
@@ -337,7 +338,7 @@ class CanopenDrive:
             now = clock.now()
             if now >= deadline or self.node.sdo.contradicted:
                 return False
-            with suppress(DrivesError):
+            with suppress(BusError):
                 self.node.nmt.send_command(ENTER_PRE_OPERATIONAL)
                 self.line.wait(WAKING)
             clock.wait_until(now + WAKING)  # on a bus that fails too: what fails may do so at once
@@ -488,7 +489,7 @@ class CanopenDrive:
         newest = ObjectInfo(ObjectAddress(0x1003, 1), "UNSIGNED32", "standard error field")
         try:
             code = self.read_optional(newest)
-        except DrivesError:
+        except (SdoError, BusError):
             return "not readable"
         return emergency_text(code & 0xFFFF) if code else "not recorded"
 

@@ -21,7 +21,7 @@ from drives.canopen_drive.strangers import Strangers, commands
 from drives.canopen_drive.sync import HostSync, KernelSync
 from drives.canopen_drive.torque_offset import why_not
 from drives.cia402 import Mode
-from drives.errors import DrivesError, LimitsError, NothingMovedError, NotSupportedError
+from drives.errors import BusError, LimitsError, NothingMovedError, NotSupportedError
 from drives.objects import ObjectInfo
 from drives.profile import AxisProfile, DriveProfile, MachineProfile, load_drive
 from drives.trace import traced
@@ -307,8 +307,9 @@ class CanopenGroup:
 
     def _leave_operational(self, drive: CanopenDrive) -> None:
         try:
-            drive.to_pre_operational()
-        except DrivesError as error:
+            with uninterrupted():
+                drive.to_pre_operational()
+        except BusError as error:
             self._warn(f"{drive.axis}: {error}")
 
 

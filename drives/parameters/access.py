@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable
 
-from drives.errors import DrivesError, NotSupportedError
+from drives.errors import NotSupportedError, SdoError
 from drives.objects import ObjectAddress, ObjectInfo
 from drives.parameters.values import ParameterDrive
 
@@ -23,7 +23,9 @@ def unlock(drive: ParameterDrive) -> None:
     NotSupportedError
         If the machine profile gives none, or the drive does not take it; nothing else was written.
     SdoError
-        If the drive does not answer.
+        If the drive does not say whether it is locked.
+    BusError, UserStopError
+        As they came: neither says anything of the password.
     """
     how = drive.profile.unlock
     if how is None or not needs_password(drive):
@@ -37,7 +39,7 @@ def unlock(drive: ParameterDrive) -> None:
     info = ObjectInfo(how.object, "VISIBLE_STRING", "password")
     try:
         drive.write(info, password)
-    except DrivesError as error:
+    except SdoError as error:
         raise NotSupportedError(
             f"{drive.axis}, object {how.object}: the drive does not take the password ({_kind(error)}). "
             "Nothing was written."
@@ -55,7 +57,7 @@ def _level(drive: ParameterDrive) -> int | None:
     return drive.read_optional(ObjectInfo(how.level, "UNSIGNED8", "user level"))
 
 
-def _kind(error: DrivesError) -> str:
+def _kind(error: SdoError) -> str:
     """Return an error without its words, which may repeat what was written."""
     code = getattr(error, "code", None)
     return f"abort code 0x{code:08X}" if isinstance(code, int) else type(error).__name__

@@ -18,7 +18,7 @@ from canopen.objectdictionary import (
     import_od,
 )
 
-from drives.errors import ProfileError
+from drives.errors import ProfileError, UserStopError
 from drives.objects import DATA_TYPES, DataType, ObjectAddress, ObjectInfo, type_range
 
 MAX_EDS_BYTES = 5_000_000
@@ -73,6 +73,8 @@ def _read(path: Path, _changed: int) -> ObjectDictionary:
         dictionary = import_od(source)
     except RecursionError:
         raise ProfileError(path, "is no EDS that can be read: it refers to itself") from None
+    except UserStopError:
+        raise
     except Exception as error:  # the EDS reader raises whatever its parser stumbles upon
         said = " ".join(str(error).split())[:160] or type(error).__name__
         raise ProfileError(

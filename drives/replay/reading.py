@@ -6,7 +6,7 @@ from typing import IO, Any
 
 import can
 
-from drives.errors import ProfileError
+from drives.errors import ProfileError, UserStopError
 from drives.trace import FORMATS
 
 _READERS: dict[str, Any] = {
@@ -43,7 +43,7 @@ def read_trace(path: Path) -> Generator[can.Message]:
             for message in _READERS[path.suffix.lower()](file):
                 found += 1
                 yield message
-    except GeneratorExit:
+    except UserStopError:
         raise
     except Exception as error:  # the readers raise whatever they stumble upon
         if not found:

@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 
 import yaml
 
-from drives.errors import DrivesError
+from drives.errors import DrivesError, ProfileError, UserStopError
 from drives.profile import MachineProfile, load_machine
 from fieldtool.criticise.criticise import Criticised
 from fieldtool.criticise.criticism_file import read_criticism
@@ -76,7 +76,13 @@ def report_of_recording(source: Path, found: Criticised, recording: Recording, o
 
 
 def material_of(folder: SessionFolder) -> Material:
-    """Read everything that a session folder holds; what can not be read is among what is missing."""
+    """Read everything that a session folder holds; what can not be read is among what is missing.
+
+    Raises
+    ------
+    UserStopError
+        If the user asked to stop while a file was read: that is no fault of the file.
+    """
     missing: list[str] = []
 
     def read(path: Path, reader: Callable[[Path], T], lacking: str) -> T | None:
@@ -86,6 +92,8 @@ def material_of(folder: SessionFolder) -> Material:
             return None
         try:
             return reader(path)
+        except UserStopError:
+            raise
         except (FieldtoolError, DrivesError) as error:
             missing.append(f"{path.name} can not be read: {error}")
             return None
@@ -146,7 +154,7 @@ def material_of(folder: SessionFolder) -> Material:
 def _prior(machine: MachineProfile | None) -> MachineModel | None:
     try:
         return prior_model(machine) if machine else None
-    except DrivesError:
+    except ProfileError:
         return None
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from drives.errors import DrivesError, ProfileError
+from drives.errors import ProfileError
 from drives.parameters import load_backup
 from drives.profile import AxisProfile, MachineProfile, load_drive, load_machine
 from drives.sim.faces import face_names
@@ -171,7 +171,7 @@ def _drive(profile: AxisProfile, beside: Path, left_out: list[str], *, known: bo
         return profile.drive
     try:
         kind = load_drive(profile.drive, beside).name
-    except DrivesError:
+    except ProfileError:
         kind = ""
     if kind in face_names():
         return profile.drive
@@ -238,7 +238,7 @@ def _gains(
     for axis in machine.axes:
         try:
             profile = load_drive(axis.drive, machine.path)
-        except DrivesError:
+        except ProfileError:
             continue
         if profile.name != REFERENCE:  # others have names and units of their own
             continue
