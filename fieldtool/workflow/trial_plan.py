@@ -53,6 +53,8 @@ STANDSTILL_TIME, STANDSTILL_TIMEOUT = 0.25, 120.0
 STANDSTILL_COUNTS, STANDSTILL_TRAVEL = 3.0, 2e-4
 """A disabled axis stands that moves by less than so many counts, or this share of its travel, in so many
 seconds, twice; waited for at most."""
+UNKNOWN_LAG = 0.25
+"""Of the cycle."""
 _UNASKED = (
     "{}: one count of its encoder makes so much torque that its controller is not asked for a first "
     "answer; it is watched from its first move on"
@@ -74,6 +76,9 @@ class TrialPlan:
     notes: tuple[str, ...]
     bare: tuple[Servo, ...] = ()
     """The new ones as an excitation by references meets them: without what can be switched off."""
+    lags: tuple[float, ...] = ()
+    """s, of each axis' torque behind a torque offset; where its profile does not know it a quarter of
+    the cycle."""
 
 
 def no_room(group: CanopenGroup, trial: Trial) -> str:
@@ -234,6 +239,7 @@ def plan_trial(
         before,
         after,
         notes,
+        lags=tuple(drive.profile.torque_lag or UNKNOWN_LAG * cycle for drive in group.drives),
     )
     return _with_excitation(plan, group, setting, steps)
 

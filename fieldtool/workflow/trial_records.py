@@ -93,7 +93,7 @@ class TrialRecords:
         )
 
     def _sensitivity(self, tried: Tried | None, k: int, servo: Servo) -> Sensitivity | None:
-        lines = self.plan.lines
+        plan, lines = self.plan, self.plan.lines
         if tried is None or lines is None:
             return None
         one = tried.excitation
@@ -102,7 +102,7 @@ class TrialRecords:
         own = lines.axis == k
         name = self.axes.names[k]
         offset = one.extra.get(f"{name}.torque_offset") if np.all(lines.by_torque[own]) else None
-        step = self.plan.trial.cycle_time
+        step = plan.trial.cycle_time
         rows = slice(-(one.samples // lines.samples - 1) * lines.samples, None)
         return measured_sensitivity(
             Excited(
@@ -112,6 +112,7 @@ class TrialRecords:
                 one.position[rows, k],
                 one.torque[rows, k],
                 None if offset is None else offset[rows],
+                plan.lags[k],
             ),
             servo,
         )
