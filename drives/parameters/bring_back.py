@@ -4,18 +4,24 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 
-from drives.errors import DrivesError, SdoTimeoutError
+from drives.cia402 import PowerState
+from drives.errors import DriveFaultError, DrivesError, SdoTimeoutError
 from drives.objects import DEVICE_TYPE, ObjectAddress
 from drives.parameters.access import take_over, unlock
 from drives.parameters.backup import DriveBackup
+from drives.parameters.guard import DISABLED_STATES
 from drives.parameters.journal import DriveRecord
 from drives.parameters.set_up import bring_set_up_back
 from drives.parameters.values import HeldObject, ParameterDrive, Raw, same
 
 PATIENCE = 10.0
 """Seconds that a drive is given to boot, or to finish storing."""
+STOPPING, LOOK = 2.0, 0.1
+"""Seconds that a drive may still take to switch off by itself, and from one look at it to the next."""
 PASSES = 3
 """Times that values are written at most: some drives take one only after another."""
+_POWERLESS = (*DISABLED_STATES, PowerState.NOT_READY_TO_SWITCH_ON)
+"""One that boots has no power either."""
 
 
 class Found(StrEnum):
@@ -82,7 +88,8 @@ def bring_back(
     Parameters
     ----------
     drive
-        Disabled.
+        Disabled, or about to be: one that could not be switched off after a motion stops by itself once
+        it misses the host.
     record
         Whose entries come back in any case.
     backup
@@ -96,9 +103,12 @@ def bring_back(
     ------
     SilentDriveError
         If the drive does not answer.
+    DriveFaultError
+        If it stays enabled: nothing was written, and its fail-safe objects are what they were.
     """
     if not drive.wakes(PATIENCE):
         raise SilentDriveError(_why_silent(drive))
+    _see_disabled(drive)
     found = look(drive, record)
     unlock(drive)
     set_up, not_set_up = bring_set_up_back(drive, backup.set_up) if whole else ((), {})
@@ -165,6 +175,31 @@ def _write(drive: ParameterDrive, held: HeldObject) -> str:
         _refuse_silent(drive, error)
         return str(error)
     return ""
+
+
+def _see_disabled(drive: ParameterDrive) -> None:
+    """Wait until a drive shows that its power is off: until then its fail-safe objects may be all that
+    stops it, and no gains change under a motor that is held.
+
+    It is not told to switch off: that was tried, and would only cut short the ramp that it is in.
+    """
+    shown = ""
+    for k in range(round(STOPPING / LOOK)):
+        if k:
+            drive.wait(LOOK)
+        try:
+            state = drive.power_state()
+        except DrivesError as error:  # one answer that is lost says nothing of the drive
+            _refuse_silent(drive, error)
+            shown = f"its state is not known: {str(error).rstrip('.')}"
+            continue
+        if state in _POWERLESS:
+            return
+        shown = f"the drive is in {state.words} and does not switch off by itself"
+    raise DriveFaultError(
+        f"{drive.axis}: {shown}; its parameters are brought back only while it is disabled. Switch it "
+        "off and on"
+    )
 
 
 def _why_silent(drive: ParameterDrive) -> str:

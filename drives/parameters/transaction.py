@@ -247,7 +247,18 @@ class Transaction:
                 cause, "__notes__", ()
             ):  # such as a drive that may still be enabled
                 error.add_note(note)
+            self._note_whole(error)
             raise
+        self._note_whole(cause)
+
+    def _note_whole(self, error: BaseException) -> None:
+        """Say which drives have come to rest since, and hold nothing any more that a trial had set."""
+        for axis, outcome in self.outcomes.items():
+            if self._drives[axis].left_changed and outcome.is_back:
+                error.add_note(
+                    f"{axis}: since then the drive has shown that it is off, and all that the trial had "
+                    "left changed in it, its fail-safe objects too, was brought back."
+                )
 
     def _refuse_or_say(self, reason: str, cause: BaseException) -> None:
         self._refuse_mixed(f"writing failed: {reason}. Not everything could be restored", cause)

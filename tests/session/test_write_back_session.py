@@ -8,10 +8,12 @@ from dataclasses import dataclass
 from importlib.resources import files
 
 import can
+import numpy as np
 import pytest
 import yaml
 
 from drives.canopen_drive import CanopenDrive
+from drives.errors import NotVerifiedError, SafetyStopError
 from drives.sim.drive_faults import PowerLossWhileStoring
 from drives.sim.faults import (
     Fault,
@@ -23,6 +25,7 @@ from drives.sim.faults import (
     StoreForgets,
     WriteAltered,
 )
+from tests.untried import Stood
 
 pytestmark = pytest.mark.usefixtures("untried")
 TABLE, ARM = 11, 12
@@ -563,3 +566,100 @@ def test_a_supply_that_fails_while_storing_leaves_old_values_everywhere(session,
     assert session.changed() == {}
     power_cycle(session)
     assert session.changed() == {}
+
+
+# --- a trial that leaves a drive enabled ----------------------------------------------------------
+
+
+class Deaf(Stood):
+    """A trial in which the table's drive leaves its PDOs behind, and does not obey 0x6040 by SDO."""
+
+    def __init__(self, _session, group, *_, **__):
+        self._group = group
+
+    def prove(self):
+        machine = self.bench.machine
+
+        def source(before):
+            if before is not None:
+                machine.inject(SdoSilent(TABLE, 0x6040))
+                machine.receive(0x000, bytes([0x80, TABLE]))  # somebody's NMT command
+            return np.tile(motion.position, (50, 1))
+
+        try:
+            with self._group.motion(0.002) as motion:
+                motion.stream(source)
+        except SafetyStopError as error:
+            failed = NotVerifiedError(f"the new parameters do not stand their trial: {error}")
+            for note in error.__notes__:
+                failed.add_note(note)
+            raise failed from error
+
+
+@pytest.fixture
+def deaf_while_tried(make_bench, monkeypatch):
+    """Make a session whose trial leaves the table enabled, with its quick stop option code 0x605A."""
+
+    def make(option):
+        bench = make_bench(objects={TABLE: {(0x605A, 0): option}})
+        bench.out.mkdir()
+        (bench.out / "machine.yaml").write_text(bench.profile.read_text())
+        write_tuning(bench, NEW)
+        monkeypatch.setattr(Deaf, "bench", bench, raising=False)
+        monkeypatch.setattr("fieldtool.workflow.writing.Verification", Deaf)
+        return bench
+
+    return make
+
+
+def written_while_powered(bench):
+    """Return where objects are noted that were written while the table's drive had power."""
+    node, seen = bench.machine.node(TABLE), []
+
+    def hear(_time, cob_id, data):
+        if cob_id == 0x600 + TABLE and data[0] & 0xE0 == 0x20 and node.motion.powered:
+            seen.append(int.from_bytes(data[1:3], "little"))
+
+    bench.machine.listen(hear)
+    return seen
+
+
+def test_a_drive_that_stops_by_itself_after_its_trial_is_taken_back_once_it_is_off(
+    deaf_while_tried,
+):
+    """Until then its fail-safe objects may be all that stops it, and its gains hold a motor."""
+    bench = deaf_while_tried(2)
+    seen = written_while_powered(bench)
+    outcome = write(bench)
+    assert outcome.code == 6
+    assert "Nothing was changed: all parameters were restored" in outcome.err
+    assert "table: node 11 does not answer after it was told to switch off" in outcome.err
+    assert "table: since then the drive has shown that it is off" in outcome.err
+    assert set(seen) <= {0x6040}
+    assert bench.powered() == {}
+    assert bench.changed() == {}
+
+
+def test_a_drive_that_never_switches_off_after_its_trial_is_left_as_it_is(deaf_while_tried):
+    """It stays in quick stop: new gains, fail-safe armed; the arm goes back, and restore ends it."""
+    bench = deaf_while_tried(6)
+    seen = written_while_powered(bench)
+    outcome = write(bench)
+    assert outcome.code == 7
+    assert (
+        "table: the drive is in quick stop active and does not switch off by itself" in outcome.err
+    )
+    assert "MAY STILL BE ENABLED" in outcome.err
+    assert "arm (node 12) holds the old values" in outcome.err
+    assert "since then the drive has shown that it is off" not in outcome.err
+    assert set(seen) <= {0x6040}
+    assert set(bench.changed()) == {TABLE}
+    assert bench.machine.node(TABLE).dictionary.read(0x1016, 1) != 0
+    assert held(bench, TABLE) == NEW_RAW
+    bench.machine.lift(SdoSilent(TABLE, 0x6040))
+    power_cycle(bench)
+    refused = write(bench)
+    assert refused.code == 3
+    assert f"fieldtool restore {bench.out}" in refused.err
+    assert bench.command("restore", bench.out).code == 0
+    assert bench.changed() == {}
