@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 
 from drives.api import AxisLimits, Capture, FloatArray, Motion, MotionWatch
-from fieldtool.errors import FieldtoolError
+from drives.canopen_drive.interrupts import uninterrupted
 from fieldtool.experiment.stepped.plan import smooth_move
 from fieldtool.records.recording import Experiment
 
@@ -133,12 +133,19 @@ def sample_times(rows: int, step: float) -> FloatArray:
     return times
 
 
+def keep_all(experiments: Iterable[Experiment], keep: Keep) -> None:
+    """Keep all that was recorded, once the drives are off; a stop waits until the last is kept."""
+    with uninterrupted():
+        for experiment in experiments:
+            keep(experiment)
+
+
 def keep_whatever_happens(
     experiments: Iterable[Experiment], keep: Keep, cause: BaseException
 ) -> None:
-    """Keep what was recorded before an error; that error counts, not one of the disk."""
+    """Keep what was recorded before an error; that error counts, not one of the disk or the memory."""
     try:
-        for experiment in experiments:
-            keep(experiment)
-    except FieldtoolError as error:
-        cause.add_note(f"what was recorded last could not be kept: {error}")
+        keep_all(experiments, keep)
+    except Exception as error:
+        why = str(error) or type(error).__name__
+        cause.add_note(f"what was recorded last could not be kept: {why}")

@@ -14,6 +14,7 @@ from fieldtool.experiment.axes import (
     Axes,
     Keep,
     Mover,
+    keep_all,
     keep_whatever_happens,
     sample_times,
 )
@@ -120,8 +121,7 @@ def check_directions(group: Mover, axes: Axes, cycle_time: float, keep: Keep) ->
     except BaseException as error:
         keep_whatever_happens(experiments, keep, error)
         raise
-    for experiment in experiments:  # the disk may be slow: not while axes wait for their SYNC
-        keep(experiment)
+    keep_all(experiments, keep)  # the disk may be slow: not while axes wait for their SYNC
 
 
 def _enabled(group: Mover, axes: Axes, cycle_time: float) -> AbstractContextManager[Motion]:

@@ -5,7 +5,6 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from drives.canopen_drive import CanopenGroup
-from fieldtool.errors import OutputError
 from fieldtool.records.raw_rows import RawRows, cut_off_rows
 from fieldtool.records.recording import Experiment, RecordingWriter, load
 from fieldtool.records.session_folder import SessionFolder
@@ -20,20 +19,19 @@ def keeping(
 ) -> Iterator[Keep]:
     """Save what axes do while they move; give what takes experiments into the recording.
 
-    The file beside the recording is removed at the end, unless the recording could not be written.
+    The file beside the recording is removed at the end, unless an experiment could not be brought into
+    the recording, whatever the reason was.
     """
     rows = RawRows(_rows_of(recording.path), group.axes)
     lacking = False
 
     def keep(experiment: Experiment) -> None:
         nonlocal lacking
-        try:
-            recording.append(experiment)
-        except OutputError:
-            lacking = True
-            raise
+        before, lacking = lacking, True  # until it is there: what ends this here may be anything
+        recording.append(experiment)
         rows.kept()
         folder.note("recorded", experiment=experiment.name, complete=experiment.complete)
+        lacking = before
 
     group.onlooker = rows
     try:

@@ -1,5 +1,6 @@
 """The trial of loops through the bus, and its watch: an oscillation is stopped within 50 ms."""
 
+import signal
 import struct
 from dataclasses import dataclass, replace
 from unittest.mock import patch
@@ -124,6 +125,19 @@ def test_good_loops_stand_the_trial_and_everything_is_recorded(bench):
     assert np.all(tried.noise < 0.5)
     assert bench.powered() == {}
     assert bench.changed() == {}
+
+
+def test_ctrl_c_while_the_trial_is_saved_waits_for_the_last(bench):
+    kept = []
+
+    def keep(experiment):
+        signal.raise_signal(signal.SIGINT)
+        kept.append(experiment.name)
+
+    with bench.connected() as group, pytest.raises(KeyboardInterrupt):
+        run_trial(group, trial(), axes_of(group), keep, "after", trusts_loops=False)
+    assert kept == ["after: move of table", "after: move of arm"]
+    assert bench.powered() == {}
 
 
 @pytest.mark.parametrize("trusts_loops", [False, True])

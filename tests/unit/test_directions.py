@@ -1,5 +1,6 @@
 """The check of directions where friction holds an axis beside its target, or its encoder is coarse."""
 
+import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
@@ -130,3 +131,16 @@ def test_a_reversed_axis_with_a_coarse_encoder_is_found():
         check(group)
     assert stop.value.axis == "y"
     assert abs(group.now[1]) < ALLOWED + 5 * count
+
+
+def test_ctrl_c_while_moves_are_saved_waits_for_the_last():
+    kept = []
+
+    def keep(experiment):
+        signal.raise_signal(signal.SIGINT)
+        kept.append(experiment.name)
+
+    axes = Axes(("x", "y"), (LIMITS, LIMITS), np.zeros(2), ("rad", "rad"))
+    with pytest.raises(KeyboardInterrupt):
+        check_directions(Group(friction(0.0)), axes, STEP, keep)
+    assert kept == ["direction check of x", "direction check of y"]

@@ -3,6 +3,7 @@
 The fake does not imitate: drives, a bus, quantisation, quick stops; it keeps no limits.
 """
 
+import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -331,6 +332,18 @@ def test_an_error_of_the_program_keeps_what_was_finished() -> None:
     kept, found = failing(FakeGroup(fail=(2500, RuntimeError("defect"))), plan_of)
     assert str(found) == "defect"
     assert [e.name for e in kept] == ["multisine 1"]
+
+
+def test_ctrl_c_while_experiments_are_saved_waits_for_the_last() -> None:
+    kept: list[str] = []
+
+    def keep(experiment: Experiment) -> None:
+        signal.raise_signal(signal.SIGINT)
+        kept.append(experiment.name)
+
+    with pytest.raises(KeyboardInterrupt):
+        run_multisine(FakeGroup(), plan(), axes(), keep)
+    assert kept == ["multisine 1", "multisine 2"]
 
 
 # -- unstable loops -------------------------------------------------------------------------------

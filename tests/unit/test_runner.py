@@ -4,6 +4,7 @@ The fake does not imitate: drives, a bus, quantisation, quick stops; what it doe
 keeps none) and with speed between two motions (each begins at rest).
 """
 
+import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -380,6 +381,37 @@ def test_what_was_recorded_until_a_stop_is_kept(error: Exception) -> None:
     assert experiment.note == str(error)
     assert experiment.samples > 1000
     assert all(s.stop <= experiment.samples for s in experiment.segments)
+
+
+def test_a_sweep_that_is_distrusted_at_its_end_is_kept() -> None:
+    """Its drive turns out to have left its mode, say: seen once all axes are off."""
+
+    class Distrusted(FakeGroup):
+        @contextmanager
+        def motion(self, cycle_time: float, free: tuple[str, ...] = ()) -> Iterator["FakeMotion"]:
+            with super().motion(cycle_time, free) as motion:
+                yield motion
+            if free:
+                raise SafetyStopError("do not rely on it")
+
+    kept: list[Experiment] = []
+    with pytest.raises(SafetyStopError):
+        run_plan(Distrusted(machine(), np.zeros(2)), plan(3.0, 6.0), axes(), kept.append)
+    (experiment,) = kept
+    assert (experiment.complete, experiment.note) == (False, "do not rely on it")
+    assert len(experiment.segments) == 2
+
+
+def test_ctrl_c_while_a_sweep_is_saved_waits_for_it() -> None:
+    kept: list[str] = []
+
+    def keep(experiment: Experiment) -> None:
+        signal.raise_signal(signal.SIGINT)
+        kept.append(experiment.name)
+
+    with pytest.raises(KeyboardInterrupt):
+        run_plan(FakeGroup(machine(), np.zeros(2)), plan(3.0), axes(), keep)
+    assert kept == ["x direct, others free"]
 
 
 def test_axes_are_centred_before_each_sweep() -> None:

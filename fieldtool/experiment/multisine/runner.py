@@ -18,6 +18,7 @@ from fieldtool.experiment.axes import (
     Mover,
     bring_to_centre,
     come_to_rest,
+    keep_all,
     keep_whatever_happens,
 )
 from fieldtool.experiment.multisine.plan import MultisinePlan, streams
@@ -115,8 +116,7 @@ def run_multisine(
     except BaseException as error:
         keep_whatever_happens(_experiments(finished), keep, error)
         raise
-    for experiment in _experiments(finished):  # the disk may be slow: not while axes are enabled
-        keep(experiment)
+    keep_all(_experiments(finished), keep)  # the disk may be slow: not while axes are enabled
     return teller.seconds
 
 

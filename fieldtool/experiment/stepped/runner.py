@@ -16,6 +16,7 @@ from fieldtool.experiment.axes import (
     Keep,
     Mover,
     bring_to_centre,
+    keep_all,
     keep_whatever_happens,
     sample_times,
 )
@@ -94,17 +95,20 @@ def run_plan(
                 bring_to_centre(motion, axes)
             teller = _Teller(report, number + 1, plan, done, machine_time)
             source = _SweepSource(sweep, first, axes, plan.cycle_time, teller)
+            recorded: object = None
             try:
                 with group.motion(plan.cycle_time, sweep.free) as motion:
                     source.start(motion.position)
-                    capture = motion.stream(source)
-            except StoppedError as error:  # once the drives are off: writing to a disk takes time
-                if isinstance(error.capture, Capture) and error.capture.rows > 1:
-                    cut = source.experiment(error.capture, complete=False, note=str(error))
+                    recorded = capture = motion.stream(source)
+            except BaseException as error:  # once the drives are off: writing to a disk takes time
+                if isinstance(error, StoppedError) and recorded is None:
+                    recorded = error.capture
+                if isinstance(recorded, Capture) and recorded.rows > 1:
+                    cut = source.experiment(recorded, complete=False, note=str(error))
                     keep_whatever_happens([cut], keep, error)
                 raise
             machine_time += capture.rows * plan.cycle_time
-            keep(source.experiment(capture))
+            keep_all([source.experiment(capture)], keep)
             first = source.next_tone
         done += len(sweep.tones)
     return machine_time

@@ -17,6 +17,7 @@ from fieldtool.experiment.axes import (
     Keep,
     Mover,
     come_to_rest,
+    keep_all,
     keep_whatever_happens,
 )
 from fieldtool.experiment.directions import CHECK_ASTRAY, CHECK_ASTRAY_ERROR, CHECK_COUNTS
@@ -190,8 +191,7 @@ def run_trial(
     except BaseException as error:
         keep_whatever_happens(kept, keep, error)
         raise
-    for experiment in kept:  # the disk may be slow: not while axes wait for their SYNC
-        keep(experiment)
+    keep_all(kept, keep)  # the disk may be slow: not while axes wait for their SYNC
     noise = np.max([np.ptp(rest.torque[rest.rows // 2 :], axis=0) for rest in rests], axis=0)
     last = next((one.torque for one in reversed(kept) if one.kind == "moves"), rests[0].torque)
     rows = round(REST_TIME / trial.cycle_time)
