@@ -33,6 +33,11 @@ LONGEST = 1000
 """Characters of a message about a profile."""
 
 
+def may_be_enabled(error: BaseException) -> bool:
+    """Whether an error, or a note of it, says that a drive may not have switched off."""
+    return any(MAY_BE_ENABLED in text for text in (str(error), *getattr(error, "__notes__", ())))
+
+
 class DrivesError(Exception):
     """Root; the message is one sentence for a person."""
 

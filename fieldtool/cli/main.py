@@ -2,7 +2,8 @@
 
 0 done; 2 wrong use or profile; 3 refused before motion; 4 stopped for safety; 5 data not good enough
 to identify; 6 write-back failed and was restored; 7 write-back failed and could not be restored; 130
-stopped by the user, machine safe.
+stopped by the user, machine safe.  Whatever ended a command: 4 if a drive may still be enabled, unless
+it is about a write (6 and 7).
 """
 
 import sys
@@ -33,7 +34,6 @@ import typer
 from threadpoolctl import threadpool_limits
 
 from drives.errors import (
-    MAY_BE_ENABLED,
     BusError,
     DrivesError,
     NothingMovedError,
@@ -43,6 +43,7 @@ from drives.errors import (
     UserStopError,
     WriteBackError,
     WriteBackMixedError,
+    may_be_enabled,
 )
 from fieldtool.cli.check import check
 from fieldtool.cli.criticise import criticise
@@ -94,6 +95,9 @@ EXIT_CODES: tuple[tuple[type[Exception], int], ...] = (
     (DrivesError, 3),
 )
 
+STOPPED = 4
+ABOUT_A_WRITE = {6, 7}
+"""Codes that stay what they are where a drive may still be enabled: they say what drives hold."""
 NAMED_BADLY = {ENAMETOOLONG, EACCES, EPERM, ELOOP, ENOTDIR, EISDIR, EINVAL}
 """What the operating system says of a name that was given, or of the rights to what it names."""
 NO_ROOM = {ENOSPC, EDQUOT, EFBIG, EROFS, EIO}
@@ -120,9 +124,13 @@ app.add_typer(profile_app, name="profile")
 app.add_typer(tools_app, name="tools")
 
 
-def exit_code(error: BaseException) -> int:
-    """Return the exit code of an error."""
-    return next((code for kind, code in EXIT_CODES if isinstance(error, kind)), 1)
+def exit_code(error: BaseException, otherwise: int = 1) -> int:
+    """Return the exit code of an error; ``otherwise`` if it is none of the tool's own.
+
+    No code that is read as a machine at rest is returned where a drive may still be enabled.
+    """
+    code = next((code for kind, code in EXIT_CODES if isinstance(error, kind)), otherwise)
+    return STOPPED if may_be_enabled(error) and code not in ABOUT_A_WRITE else code
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -141,7 +149,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except KeyboardInterrupt as error:
         _tell("stopped by the user")
         _tell_notes(error)
-        sys.exit(130)
+        sys.exit(exit_code(error, 130))
     except OSError as error:
         known = NAMED_BADLY | NO_ROOM if error.filename is not None else {ENOSPC}
         if error.errno not in known:
@@ -150,7 +158,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         drop_output()
         _tell(f"{where[:LONGEST_NAME]}: {error.strerror}")
         _tell_notes(error)
-        sys.exit(2 if error.errno in NAMED_BADLY else 3)
+        sys.exit(exit_code(error, 2 if error.errno in NAMED_BADLY else 3))
     except Exception as error:  # a defect of the tool: still one sentence, and nothing lost
         _defect(error)
 
@@ -160,14 +168,14 @@ def _defect(error: Exception) -> NoReturn:
     _tell_notes(error)
     stopped = (
         "Axes were told to stop, not all have said that they did: see above."
-        if any(MAY_BE_ENABLED in note for note in _notes(error))
+        if may_be_enabled(error)
         else "If axes were moving, they were stopped."
     )
     _tell(
         f"unexpected {type(error).__name__}: {error}. {stopped} "
         f"This is a defect of fieldtool; please report it{_kept(traceback.format_exc())}"
     )
-    sys.exit(1)
+    sys.exit(exit_code(error))
 
 
 def _notes(error: BaseException) -> tuple[str, ...]:

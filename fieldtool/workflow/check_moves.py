@@ -8,7 +8,7 @@ from pathlib import Path
 from drives.bus import Bus, clock_of
 from drives.bus.clock import WallClock
 from drives.canopen_drive import CanopenGroup, connect
-from drives.errors import DrivesError, SafetyStopError, UserStopError
+from drives.errors import DrivesError, SafetyStopError, UserStopError, may_be_enabled
 from drives.profile import MachineProfile
 from fieldtool.errors import FieldtoolError, PlanRefusedError
 from fieldtool.experiment.axes import Axes
@@ -61,7 +61,7 @@ class MoveChecks:
         self.moved = False
         """Whether axes were enabled."""
         self.stopped = False
-        """Whether a safety stop ended it."""
+        """Whether a safety stop ended it, or a drive may still be enabled."""
 
     def run(self, bus: Bus, stop_requested: Callable[[], bool]) -> None:
         """Plan, move, judge; what goes wrong is a finding.
@@ -148,6 +148,7 @@ class MoveChecks:
             )
 
     def _ended(self, error: Exception, axis: str) -> None:
+        self.stopped = self.stopped or may_be_enabled(error)
         text = str(error).removeprefix(f"{axis}: ") if axis else str(error)
         notes = " ".join(getattr(error, "__notes__", ()))
         check = "direction" if axis else "moves"

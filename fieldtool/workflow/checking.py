@@ -40,7 +40,7 @@ class CheckResult:
     moved: bool
     """Whether axes were enabled and moved."""
     stopped: bool = False
-    """Whether a safety stop ended the moves."""
+    """Whether a safety stop ended the moves, or a drive may still be enabled after them."""
 
     @property
     def verdict(self) -> Status:

@@ -6,12 +6,14 @@ import math
 import can
 import pytest
 
+from drives.errors import MAY_BE_ENABLED, DriveFaultError
 from drives.sim.faults import (
     DriveFault,
     EncoderStuck,
     MotorReversed,
     NodeVanishes,
     SdoRefused,
+    SdoSilent,
 )
 from fieldtool.workflow import check_moves
 
@@ -233,6 +235,46 @@ def test_the_users_stop_is_130_and_safe(small_bench, monkeypatch) -> None:
     assert outcome.code == 130
     assert small_bench.powered() == {}
     assert small_bench.changed() == {}
+
+
+def test_the_users_stop_is_4_where_a_drive_does_not_switch_off(
+    small_bench, tmp_path, monkeypatch
+) -> None:
+    from fieldtool.cli.stop_key import StopKey
+
+    monkeypatch.chdir(tmp_path)  # what is left to be restored is noted there
+    calls = 0
+
+    def pressed(_self: StopKey) -> bool:
+        nonlocal calls
+        calls += 1
+        if calls == 300:
+            small_bench.inject(SdoSilent(11, 0x6040))
+            small_bench.machine.receive(0x000, bytes([0x80, 11]))  # NMT: its PDOs are dead then
+        return calls >= 300
+
+    monkeypatch.setattr(StopKey, "__call__", pressed)
+    outcome = small_bench.command("check", small_bench.profile, "--move")
+    assert "table: node 11 does not answer after it was told to switch off" in outcome.err
+    assert MAY_BE_ENABLED in outcome.err
+    assert "fieldtool restore sessions" in outcome.err
+    assert outcome.code == 4
+
+
+@pytest.mark.parametrize("enabled", [False, True])
+def test_a_drive_that_does_not_enable_while_another_stays_enabled_is_4(
+    small_bench, monkeypatch, enabled
+) -> None:
+    def fails(*_arguments: object) -> None:
+        error = DriveFaultError("table: does not follow the controlword")
+        if enabled:
+            error.add_note(f"table: it {MAY_BE_ENABLED}")
+        raise error
+
+    monkeypatch.setattr(check_moves, "check_directions", fails)
+    outcome = small_bench.command("check", small_bench.profile, "--move", "--json")
+    assert outcome.code == (4 if enabled else 3)
+    assert (MAY_BE_ENABLED in outcome.out) == enabled
 
 
 def test_ctrl_c_while_a_drive_is_read_is_no_finding(small_bench, monkeypatch) -> None:

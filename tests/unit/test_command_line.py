@@ -14,8 +14,17 @@ import typer
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from drives.errors import (
+    DriveFaultError,
+    ProfileError,
+    SafetyStopError,
+    UserStopError,
+    WriteBackError,
+    WriteBackMixedError,
+)
 from fieldtool.cli.main import app, main
 from fieldtool.cli.output import confirmed, console_of
+from fieldtool.errors import NotEnoughDataError, OutputError
 
 CODES = {0, 2, 3, 4, 5, 6, 7, 130}
 NOTHING_MOVES = {"run": "--plan-only", "measure": "--plan-only", "check": "--no-move"}
@@ -141,6 +150,40 @@ def test_what_is_noted_of_the_machine_is_said_whatever_ended_the_command(
     said = capsys.readouterr().err
     assert said.count("fieldtool: table: it MAY STILL BE ENABLED. Use the emergency stop.") == 1
     assert "they were stopped" not in said
+
+
+@pytest.mark.parametrize(
+    ("error", "safe", "unsafe"),
+    [
+        (UserStopError("stopped"), 130, 4),
+        (KeyboardInterrupt(), 130, 4),
+        (DriveFaultError("does not enable"), 3, 4),
+        (OutputError("no room"), 3, 4),
+        (ProfileError("a.yaml", "wrong"), 2, 4),
+        (PermissionError(errno.EACCES, "Permission denied", "a/b"), 2, 4),
+        (OSError(errno.EROFS, "Read-only file system", "a/b"), 3, 4),
+        (ValueError("so"), 1, 4),
+        (NotEnoughDataError("noise"), 5, 4),
+        (SafetyStopError("a limit"), 4, 4),
+        (WriteBackError("refused"), 6, 6),
+        (WriteBackMixedError("refused", {}), 7, 7),
+    ],
+)
+def test_no_exit_code_says_safe_where_a_drive_may_still_be_enabled(
+    monkeypatch, capsys, error, safe, unsafe
+):
+    def fails(**_: object) -> None:
+        raise error
+
+    cli = import_module("fieldtool.cli.main")
+    monkeypatch.setattr(cli, "app", fails)
+    monkeypatch.setattr(cli, "drop_output", lambda: None)
+    for code, note in ((safe, "arm: could not be put back"), (unsafe, "it MAY STILL BE ENABLED")):
+        error.add_note(note)
+        with pytest.raises(SystemExit) as ended:
+            main([])
+        assert ended.value.code == code
+        assert note in capsys.readouterr().err
 
 
 def test_no_answer_at_all_is_a_no(monkeypatch, capsys):
