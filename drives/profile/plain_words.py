@@ -4,6 +4,8 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+UNBUILT = (ValueError, TypeError, LookupError, AttributeError)
+"""What the YAML library raises where a value is not of the type that stands before it: ``!!int x``."""
 Place = tuple[str | int, ...]
 _COMMA = re.compile(r"\s*([+-]?\d+),(\d+)(\s.*)?")
 _UNDER = "this line does not stand under the ones above"

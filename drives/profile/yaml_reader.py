@@ -6,7 +6,7 @@ from typing import Any
 import yaml
 
 from drives.errors import ProfileError
-from drives.profile.plain_words import misread, syntax_words
+from drives.profile.plain_words import UNBUILT, misread, syntax_words
 
 MAX_PROFILE_BYTES = 1_000_000
 MAX_DEPTH = 30
@@ -65,8 +65,10 @@ def read_yaml(path: Path, largest: int = MAX_PROFILE_BYTES) -> tuple[Any, Lines]
         raise ProfileError(
             path, f"is no YAML: {syntax_words(error.problem)}", mark.line + 1 if mark else None
         ) from None
-    except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
+    except (yaml.YAMLError, RecursionError) as error:
         raise ProfileError(path, f"is no YAML: {' '.join(str(error).split())}") from None
+    except UNBUILT as error:
+        raise ProfileError(path, f"has a value YAML can not build: {error}") from None
 
 
 def _refuse_aliases(text: str, path: Path) -> None:

@@ -9,7 +9,6 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from fieldtool.errors import FileFormatError
 from fieldtool.records.hdf5_file import MemoryFile, Reader, opened, put
 
 FloatArray = NDArray[np.float64]
@@ -88,10 +87,7 @@ def load_pictures(path: Path) -> tuple[Picture, ...]:
         If it is missing, damaged, or of another format.
     """
     with opened(path, FORMAT) as reader:
-        try:
-            return tuple(_read(one) for one in reader.child("pictures").children())
-        except (ValueError, OSError, RuntimeError) as error:
-            raise FileFormatError(path, f"is damaged ({error}).") from error
+        return tuple(_read(one) for one in reader.child("pictures").children())
 
 
 def _read(reader: Reader) -> Picture:

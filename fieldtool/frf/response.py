@@ -15,7 +15,6 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from fieldtool.errors import FileFormatError
 from fieldtool.records.hdf5_file import MemoryFile, Reader, opened, put
 
 FloatArray = NDArray[np.float64]
@@ -109,6 +108,15 @@ class ModelBand:
     relative_std: FloatArray
     """(B, M, M): standard error of the logarithm of the size."""
 
+    def __post_init__(self) -> None:
+        B = self.frequencies.size
+        if not B or not 0 < self.frequencies[0] < np.inf or np.any(np.diff(self.frequencies) <= 0):
+            raise ValueError("frequencies of a band must rise from above 0 Hz")
+        if self.relative_std.ndim != 3 or self.relative_std.shape[0] != B:
+            raise ValueError(
+                f"relative_std must have shape {(B, 'M', 'M')}, got {self.relative_std.shape}"
+            )
+
 
 def save_responses(
     responses: Mapping[str, FrequencyResponse], path: Path | str, band: ModelBand | None = None
@@ -152,13 +160,7 @@ def load_responses(path: Path | str) -> dict[str, FrequencyResponse]:
         If it is missing, no HDF5 file, of another format, damaged, or contradicts itself.
     """
     with opened(path, FORMAT) as reader:
-        try:
-            found = [_read(group) for group in reader.child("responses").children()]
-        except ValueError as error:
-            raise FileFormatError(path, f"does not hold a valid response: {error}.") from error
-        except (OSError, RuntimeError) as error:
-            raise FileFormatError(path, f"is damaged ({error}).") from error
-    return dict(found)
+        return dict(_read(group) for group in reader.child("responses").children())
 
 
 def load_band(path: Path | str) -> ModelBand | None:
@@ -173,11 +175,9 @@ def load_band(path: Path | str) -> ModelBand | None:
         if "band" not in reader.group:
             return None
         held = reader.child("band")
-        frequencies = held.array("frequencies", np.float64, 1)
-        relative_std = held.array("relative_std", np.float64, 3)
-        if relative_std.shape[0] != frequencies.size:
-            raise held.fault("frequencies and relative_std are not of one length.")
-        return ModelBand(frequencies, relative_std)
+        return ModelBand(
+            held.array("frequencies", np.float64, 1), held.array("relative_std", np.float64, 3)
+        )
 
 
 def _read(reader: Reader) -> tuple[str, FrequencyResponse]:

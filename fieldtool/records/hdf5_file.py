@@ -74,12 +74,16 @@ class Reader:
         """Return all groups inside this one, by rising name."""
         return [self.child(name) for name in sorted(self.group)]
 
+    def rows(self, name: str) -> int:
+        """Return how many rows the dataset ``name`` has; nothing of it is read."""
+        found = self._dataset(name)
+        if not found.ndim:
+            raise self.fault(f"the dataset '{name}' is one value and has no rows.")
+        return int(found.shape[0])
+
     def array(self, name: str, dtype: Any, ndim: int) -> NDArray[Any]:
         """Return the dataset ``name`` as an array of ``ndim`` dimensions and type ``dtype``."""
-        found = self.group.get(name)
-        if not isinstance(found, h5py.Dataset):
-            raise self.fault(f"the dataset '{name}' is missing; the file is damaged or of another "
-                             "program.")  # fmt: skip
+        found = self._dataset(name)
         if found.ndim != ndim or found.size > MAX_VALUES:
             raise self.fault(f"the dataset '{name}' has the shape {found.shape}, which is "
                              f"not {ndim}-dimensional or above {MAX_VALUES} values.")  # fmt: skip
@@ -89,6 +93,13 @@ class Reader:
             return np.asarray(found[()], dtype=dtype)
         except OSError as error:
             raise self.fault(f"the dataset '{name}' is damaged ({error}).") from error
+
+    def _dataset(self, name: str) -> Any:
+        found = self.group.get(name)
+        if not isinstance(found, h5py.Dataset):
+            raise self.fault(f"the dataset '{name}' is missing; the file is damaged or of another "
+                             "program.")  # fmt: skip
+        return found
 
     def optional_array(self, name: str, dtype: Any, ndim: int) -> NDArray[Any] | None:
         """Return the dataset ``name``, or None where the file has none."""
@@ -111,7 +122,7 @@ class Reader:
     def number(self, name: str) -> float:
         """Return the number attribute ``name``."""
         value: Any = self._attribute(name)
-        if isinstance(value, bool) or not isinstance(value, int | float | np.number):
+        if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
             raise self.fault(f"the attribute '{name}' is no number.")
         return float(value)
 
@@ -120,11 +131,24 @@ class Reader:
         return self.number(name) if name in self.group.attrs else None
 
     def _attribute(self, name: str, default: object | None = None) -> Any:
-        value = self.group.attrs.get(name, default)
+        value = _value(self.group, name)
+        value = default if value is None else value
         if value is None:
             raise self.fault(f"the attribute '{name}' is missing; the file is damaged or of "
                              "another program.")  # fmt: skip
         return value
+
+
+def _value(group: Any, name: str) -> Any:
+    """Return an attribute; None where there is none, or it is a list of any length.
+
+    No file has such lists, and one changed byte makes one of a text: of a kind that the HDF5 library
+    (2.0) does not know, and whose values it looks for anywhere in memory.
+    """
+    attributes = group.attrs
+    if name not in attributes or attributes.get_id(name).get_type().get_class() == h5py.h5t.VLEN:
+        return None
+    return attributes[name]
 
 
 def _is_text(value: object) -> bool:
@@ -175,26 +199,29 @@ def opened(path: Path | str, file_format: str) -> Iterator[Reader]:
     Raises
     ------
     FileFormatError
-        If it is no HDF5 file or its attribute ``format`` is not ``file_format``.
+        If it is no HDF5 file, its attribute ``format`` is not ``file_format``, or what is read of it
+        inside the block is damaged or contradicts itself (ValueError).
     """
     path = Path(path)
     if check_size(path, MAX_BYTES):
         _check_heaps(path)
     try:
         file = h5py.File(path, "r")
-    except OSError as error:
+    except DAMAGED as error:
         raise FileFormatError(
             path, f"is not a readable HDF5 file, expected {file_format}."
         ) from error
     with file:
         try:
-            found = file.attrs.get("format")
+            found = _value(file, "format")
+            if not isinstance(found, str) or found != file_format:
+                raise FileFormatError(
+                    path,
+                    f"has the format {found!r}, expected '{file_format}': it is of another "
+                    "program or of a newer version.",
+                )
+            yield Reader(path, file)
         except DAMAGED as error:
             raise FileFormatError(path, f"is damaged ({error}).") from error
-        if not isinstance(found, str) or found != file_format:
-            raise FileFormatError(
-                path,
-                f"has the format {found!r}, expected '{file_format}': it is of another "
-                "program or of a newer version.",
-            )
-        yield Reader(path, file)
+        except ValueError as error:
+            raise FileFormatError(path, f"contradicts itself: {error}.") from error

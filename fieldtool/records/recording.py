@@ -7,6 +7,7 @@ optional group ``controller``; groups ``experiments/0000``, ... with the fields 
 of one dataset per field.  What is None is left out.  Signals are stored without loss.
 """
 
+from math import inf
 from pathlib import Path
 from types import TracebackType
 from typing import Any, cast
@@ -14,8 +15,7 @@ from typing import Any, cast
 import h5py
 import numpy as np
 
-from fieldtool.errors import FileFormatError
-from fieldtool.records.hdf5_file import DAMAGED, MemoryFile, Reader, opened, put
+from fieldtool.records.hdf5_file import MemoryFile, Reader, opened, put
 from fieldtool.records.recorded import (
     AxisInfo,
     Controller,
@@ -138,13 +138,19 @@ def save(recording: Recording, path: Path | str) -> None:
 
 
 def recorded_seconds(path: Path) -> float:
-    """Return the seconds that a recording holds, all experiments together; 0 if it can not be read."""
-    try:
-        with h5py.File(path, "r") as file:
-            rows = sum(len(one["time"]) for one in file["experiments"].values())
-            return float(rows * file.attrs["sample_period"])
-    except (*DAMAGED, ValueError):
-        return 0.0
+    """Return the seconds that a recording holds, all experiments together; no signal is read.
+
+    Raises
+    ------
+    FileFormatError
+        As :func:`load`.
+    """
+    with opened(path, FORMAT) as reader:
+        rows = sum(one.rows("time") for one in reader.child("experiments").children())
+        seconds = rows * reader.number("sample_period")
+        if not 0.0 <= seconds < inf:
+            raise reader.fault(f"{rows} rows of one 'sample_period' are {seconds} s.")
+        return seconds
 
 
 def load(path: Path | str) -> Recording:
@@ -157,12 +163,7 @@ def load(path: Path | str) -> Recording:
         itself.
     """
     with opened(path, FORMAT) as reader:
-        try:
-            return _read_recording(reader)
-        except ValueError as error:
-            raise FileFormatError(path, f"does not hold a valid recording: {error}.") from error
-        except DAMAGED as error:
-            raise FileFormatError(path, f"is damaged ({error}).") from error
+        return _read_recording(reader)
 
 
 def _write_header(root: Any, recording: Recording) -> None:

@@ -10,7 +10,13 @@ from typing import Annotated, Any, TypeVar
 import yaml
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
-from drives.profile.plain_words import misread, place_words, problem_words, syntax_words
+from drives.profile.plain_words import (
+    UNBUILT,
+    misread,
+    place_words,
+    problem_words,
+    syntax_words,
+)
 from fieldtool.errors import FileFormatError
 from fieldtool.records.files import MEBIBYTE, read_text, write_atomic
 
@@ -37,6 +43,12 @@ class StrictModel(BaseModel):
     """Base of all file schemas: unknown keys are refused."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class PartModel(BaseModel):
+    """Base of what is read of a file that has more in it: unknown keys are passed over."""
+
+    model_config = ConfigDict(extra="ignore", frozen=True)
 
 
 def read_checked(path: Path | str, schema: type[Model]) -> tuple[Model, Mapping[Path_, int]]:
@@ -126,7 +138,7 @@ def _parse(path: Path, text: str) -> tuple[Any, dict[Path_, int]]:
     except yaml.YAMLError as error:
         problem = " ".join(str(error).split())
         raise FileFormatError(path, f"is not valid YAML: {problem}.") from error
-    except (ValueError, TypeError) as error:  # a date or number that YAML can not build
+    except UNBUILT as error:
         raise FileFormatError(path, f"has a value YAML can not build: {error}.") from error
 
 

@@ -172,7 +172,7 @@ def _tick(value: float) -> str:
 
 
 def _grid(measured: FrequencyResponse | None, band: ModelBand | None) -> FloatArray:
-    if measured is not None:
+    if measured is not None and measured.frequencies.size:
         low, high = measured.frequencies[0] * 0.9, measured.frequencies[-1] * 1.1
     elif band is not None:
         low, high = band.frequencies[0], band.frequencies[-1]

@@ -12,6 +12,7 @@ from fieldtool.design.tuning import Tuning
 from fieldtool.frf.response import FrequencyResponse, ModelBand
 from fieldtool.records.model import MachineModel
 from fieldtool.records.recording import Recording
+from fieldtool.report.trial_file import TrialFile
 
 Event = Mapping[str, Any]
 
@@ -38,8 +39,8 @@ class Material:
     criticism: Criticism | None = None
     pictures: tuple[Picture, ...] = ()
     tuning: Tuning | None = None
-    documents: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    """Files of later stages by name without suffix (``verification`` ...), as plain values."""
+    trial: TrialFile | None = None
+    """What the trial of new parameters showed."""
     events: tuple[Event, ...] = ()
     missing: tuple[str, ...] = ()
     """One sentence for each thing that is not there, or can not be read."""

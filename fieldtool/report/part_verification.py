@@ -1,13 +1,14 @@
 """Before and after: what new parameters did on the machine, against the old ones and the prediction."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from fieldtool.report.figures import layout, log_ticks
+from fieldtool.report.figures import layout, log_ticks, numbers
 from fieldtool.report.material import Material
 from fieldtool.report.section import Block, Plot, Plots, Section, Table, Words
+from fieldtool.report.trial_file import AxisTrial, Figures, Values
 from fieldtool.report.words import AT_ONCE
 
 COLOURS = {"before": "#9aa5b1", "predicted": "#d1495b", "after": "#1f3b73"}
@@ -26,35 +27,32 @@ FIGURES = (
 
 def verification(material: Material) -> Section | None:
     """Show the trial's figures on one scale, moves and sensitivities."""
-    held = material.documents.get("verification")
-    if held is None:
+    trial = material.trial
+    if trial is None:
         return None
-    axes: Sequence[Mapping[str, Any]] = held.get("axes") or ()
     rows = [
         (
-            str(axis["axis"]),
+            axis.axis,
             title,
-            *(_cell(axis, when, name) for when in COLOURS),
-            _unit(str(axis.get("unit", "")), unit),
+            *(_cell(getattr(axis, when), name) for when in COLOURS),
+            _unit(axis.unit, unit),
         )
-        for axis in axes
+        for axis in trial.axes
         for title, name, unit in FIGURES
     ]
     blocks: list[Block] = [
         Table(("axis", "figure", *COLOURS, "unit"), tuple(rows), "The same short test each time.")
     ]
-    plots = [plot for axis in axes for plot in (_move(axis), _sensitivity(axis)) if plot]
+    plots = [plot for axis in trial.axes for plot in (_move(axis), _sensitivity(axis)) if plot]
     if plots:
         blocks.append(Plots(tuple(plots)))
-    notes = tuple(str(note) for note in held.get("notes") or ())
-    if notes:
-        blocks.append(Words(notes, "list"))
-    return Section("Before and after", str(held.get("sentence", "")), tuple(blocks))
+    if trial.notes:
+        blocks.append(Words(tuple(trial.notes), "list"))
+    return Section("Before and after", trial.sentence, tuple(blocks))
 
 
-def _cell(axis: Mapping[str, Any], when: str, name: str) -> str:
-    figures = axis.get(when)
-    value = figures.get(name) if figures else None
+def _cell(figures: Figures | None, name: str) -> str:
+    value = getattr(figures, name, None)
     if value is None:
         return ""
     if name == "settling_time":
@@ -66,11 +64,11 @@ def _unit(position: str, unit: str) -> str:
     return {"position": position, "torque": TORQUES.get(position, "")}.get(unit, unit)
 
 
-def _lines(curves: Mapping[str, tuple[Any, Any]]) -> list[dict[str, Any]]:
+def _lines(curves: Mapping[str, tuple[Values, Values]]) -> list[dict[str, Any]]:
     return [
         {
-            "x": x,
-            "y": y,
+            "x": numbers(np.array(x)),
+            "y": numbers(np.array(y)),
             "name": name,
             "mode": "lines",
             "line": {"color": COLOURS[name], "dash": "dash" if name == "predicted" else "solid"},
@@ -79,29 +77,29 @@ def _lines(curves: Mapping[str, tuple[Any, Any]]) -> list[dict[str, Any]]:
     ]
 
 
-def _move(axis: Mapping[str, Any]) -> Plot | None:
-    curves = axis.get("curves") or {}
-    known = {name: (curves["time"], curves[name]) for name in COLOURS if name in curves}
+def _move(axis: AxisTrial) -> Plot | None:
+    curves = axis.curves
+    known = {
+        name: (curves.time, found)
+        for name in COLOURS
+        if (found := getattr(curves, name)) is not None
+    }
     if not known:
         return None
-    figure = {
-        "data": _lines(known),
-        "layout": layout("time, s", f"position, {axis.get('unit', '')}"),
-    }
-    return Plot(figure, f"{axis['axis']}: its typical move")
+    figure = {"data": _lines(known), "layout": layout("time, s", f"position, {axis.unit}")}
+    return Plot(figure, f"{axis.axis}: its typical move")
 
 
-def _sensitivity(axis: Mapping[str, Any]) -> Plot | None:
-    curves = axis.get("sensitivity") or {}
+def _sensitivity(axis: AxisTrial) -> Plot | None:
     known = {
-        name: (curves[name]["frequency"], curves[name]["size"])
+        name: (found.frequency, found.size)
         for name in COLOURS
-        if curves.get(name)
+        if (found := getattr(axis.sensitivity, name)) is not None
     }
     if not known:
         return None
     look = layout("frequency, Hz", "sensitivity", logarithmic=True)
     for which, k in (("xaxis", 0), ("yaxis", 1)):
-        log_ticks(look[which], np.concatenate([np.asarray(c[k], float) for c in known.values()]))
+        log_ticks(look[which], np.concatenate([np.array(c[k]) for c in known.values()]))
     figure = {"data": _lines(known), "layout": look}
-    return Plot(figure, f"{axis['axis']}: sensitivity, all other loops closed")
+    return Plot(figure, f"{axis.axis}: sensitivity, all other loops closed")

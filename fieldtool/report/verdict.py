@@ -31,12 +31,9 @@ TONES = {
 
 def verdict(material: Material) -> tuple[str, str]:
     """Return one plain sentence, and its tone: good, mixed or open."""
-    for name in ("verification",):
-        said = material.documents.get(name, {}).get("sentence")
-        if isinstance(said, str) and material.criticism is not None:
-            return f"{_of(material.criticism)} {said}", TONES[material.criticism.verdict]
     if material.criticism is not None:
-        return _of(material.criticism), TONES[material.criticism.verdict]
+        tried = f" {material.trial.sentence}" if material.trial is not None else ""
+        return f"{_of(material.criticism)}{tried}", TONES[material.criticism.verdict]
     stopped = _stopped(material)
     if material.model is not None:
         return f"The machine was identified; its simulation was not criticised.{stopped}", "open"

@@ -5,8 +5,6 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
-import yaml
-
 from drives.errors import DrivesError, ProfileError, UserStopError
 from drives.profile import MachineProfile, load_machine
 from fieldtool.criticise.criticise import Criticised
@@ -14,22 +12,20 @@ from fieldtool.criticise.criticism_file import read_criticism
 from fieldtool.criticise.pictured import pictures_of
 from fieldtool.criticise.pictures_file import load_pictures
 from fieldtool.design.tuning_file import read_tuning
-from fieldtool.errors import FieldtoolError, FileFormatError
+from fieldtool.errors import FieldtoolError
 from fieldtool.frf.response import load_band, load_responses
 from fieldtool.records.files import read_text
 from fieldtool.records.model import MachineModel
 from fieldtool.records.model_file import read_model
 from fieldtool.records.recording import Recording, load, recorded_seconds
 from fieldtool.records.session_folder import SessionFolder
-from fieldtool.records.yaml_file import MAX_BYTES
 from fieldtool.report.contents import page_of
 from fieldtool.report.material import Material
 from fieldtool.report.page import write_page
+from fieldtool.report.trial_file import read_trial
 from fieldtool.workflow.models import is_simulated, prior_model, truth_model
 from fieldtool.workflow.rescued import rescue
 
-DOCUMENTS = ("prediction", "verification")
-"""Files of later stages (``NAME.yaml``) that are shown where they are there."""
 LARGEST_LOG = 64 * 1024 * 1024
 T = TypeVar("T")
 
@@ -130,7 +126,7 @@ def material_of(folder: SessionFolder) -> Material:
         prior=_prior(machine),
         truth=truth_model(machine) if machine else None,
         recording=recording,
-        trial_seconds=sum(map(recorded_seconds, folder.trials)),
+        trial_seconds=sum(read(path, recorded_seconds, "") or 0.0 for path in folder.trials),
         responses=responses or {},
         band=read(folder.frequency_response, load_band, "") if responses else None,
         model=model,
@@ -141,11 +137,7 @@ def material_of(folder: SessionFolder) -> Material:
             read_tuning,
             "no controller was designed: `fieldtool design` on this folder.",
         ),
-        documents={
-            name: found
-            for name in DOCUMENTS
-            if (found := read(folder.path / f"{name}.yaml", _document, "")) is not None
-        },
+        trial=read(folder.verification, read_trial, ""),
         events=events,
         missing=tuple(missing),
     )
@@ -156,16 +148,6 @@ def _prior(machine: MachineProfile | None) -> MachineModel | None:
         return prior_model(machine) if machine else None
     except ProfileError:
         return None
-
-
-def _document(path: Path) -> Mapping[str, Any]:
-    try:
-        data = yaml.safe_load(read_text(path, MAX_BYTES))
-    except yaml.YAMLError as error:
-        raise FileFormatError(path, f"is no YAML ({' '.join(str(error).split())}).") from error
-    if not isinstance(data, Mapping):
-        raise FileFormatError(path, "holds no keys and values.")
-    return data
 
 
 def _events(path: Path) -> tuple[tuple[Mapping[str, Any], ...], int]:

@@ -14,10 +14,7 @@ from drives.parameters import Change
 from drives.profile import MachineProfile, load_machine
 from fieldtool.design.tuning import Tuning
 from fieldtool.design.tuning_file import read_tuning
-from fieldtool.errors import (
-    FieldtoolError,
-    NotEnoughDataError,
-)
+from fieldtool.errors import FieldtoolError, FileFormatError, NotEnoughDataError
 from fieldtool.frf.response import ModelBand, save_responses
 from fieldtool.identify.likelihood.model_band import relative_std
 from fieldtool.identify.recorded import Identified, identify_recording
@@ -133,6 +130,7 @@ def run(
                 report(opened.folder.path)
         raise
     _reported(session)
+    moving_time = _moving_time(session)
     return SessionResult(
         session.folder.path,
         identified.model,
@@ -145,7 +143,7 @@ def run(
         tuple(session.warnings),
         criticism,
         verification,
-        sum(map(recorded_seconds, (session.folder.recording, *session.folder.trials))),
+        moving_time,
     )
 
 
@@ -335,6 +333,17 @@ def _reported(session: Session) -> None:
         report(session.folder.path)
     except FieldtoolError as error:
         session.warn(f"The report was not written: {error}")
+
+
+def _moving_time(session: Session) -> float:
+    """Return the seconds of all recordings of a session; one that can not be read is warned of."""
+    seconds = 0.0
+    for path in (session.folder.recording, *session.folder.trials):
+        try:
+            seconds += recorded_seconds(path)
+        except FileFormatError as error:
+            session.warn(f"The machine time lacks {path.name}: {error}")
+    return seconds
 
 
 def _measured(session: Session, group: CanopenGroup, options: Options) -> float:

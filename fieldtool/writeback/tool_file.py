@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 import yaml
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ValidationError
 
 from drives.errors import ProfileError
 from drives.parameters import DriveRecord
@@ -17,7 +17,7 @@ from drives.profile import read_yaml
 from drives.profile.plain_words import place_words, problem_words
 from drives.profile.yaml_reader import line_of
 from fieldtool.design.tuning import why_not_stored
-from fieldtool.records.yaml_file import Number, StrictModel
+from fieldtool.records.yaml_file import Number, PartModel, StrictModel
 
 FORMAT = "fieldtool-tool/1"
 FIGURES = ("settling_time", "overshoot", "sensitivity_peak")
@@ -43,30 +43,24 @@ class _Whole(ToolFile):
     checksum: str
 
 
-class _Part(BaseModel):
-    """Part of a file that has more in it."""
-
-    model_config = ConfigDict(extra="ignore", frozen=True)
-
-
-class _Parameter(_Part):
+class _Parameter(PartModel):
     axis: str
     object: str
     raw: int | float | str
 
 
-class _After(_Part):
+class _After(PartModel):
     settling_time: Number | None
     overshoot: Number | None
     sensitivity_peak: Number | None
 
 
-class _Axis(_Part):
+class _Axis(PartModel):
     axis: str
     after: _After | None
 
 
-class _Verification(_Part):
+class _Verification(PartModel):
     verdict: str
     model: str = "prior"
     bound: Number | None = None

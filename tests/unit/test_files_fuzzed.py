@@ -140,6 +140,20 @@ def test_nothing_in_a_profile_is_ever_run(folder, data):
     assert not marker.exists()
 
 
+@pytest.mark.parametrize("kind", ["null", "bool", "int", "float", "binary", "timestamp", "set",
+                                  "omap", "pairs", "merge", "value", "seq", "map"])  # fmt: skip
+@pytest.mark.parametrize(
+    ("read", "error"), [(load_machine, ProfileError), (read_model, FileFormatError)]
+)
+def test_values_that_are_not_of_the_type_before_them(tmp_path, read, error, kind):
+    """``!!int x`` and its like, as a value and as a key."""
+    path = tmp_path / "file.yaml"
+    for value in ("''", "x", "1", "-", "0x", "2020-13-45", "[1]", "[[1]]", "{a: 1}"):
+        for text in (f"format: !!{kind} {value}", f"? !!{kind} {value}\n: 1"):
+            path.write_text(text)
+            assert in_words(lambda: read(path), error) is None, text
+
+
 def numbers_in(value) -> list[float]:
     if isinstance(value, dict):
         return [n for part in value.values() for n in numbers_in(part)]

@@ -8,7 +8,14 @@ import numpy as np
 import pytest
 
 from fieldtool.errors import FileFormatError, OutputError
-from fieldtool.frf.response import FrequencyResponse, load_responses, save_responses
+from fieldtool.frf.response import (
+    FrequencyResponse,
+    ModelBand,
+    load_band,
+    load_responses,
+    save_responses,
+)
+from tests.fuzzed import in_words
 from tests.seeds import fresh_seed
 
 
@@ -73,3 +80,55 @@ def test_files_that_are_not_ours(tmp_path: Path) -> None:
         load_responses(path)
     with pytest.raises(OutputError, match="no folder"):
         save_responses({}, tmp_path / "no" / "f.h5")
+
+
+BAND = ModelBand(np.geomspace(1.0, 100.0, 9), np.full((9, 2, 2), 0.01))
+
+
+def test_the_band_survives_its_file_and_may_be_missing(tmp_path: Path) -> None:
+    path = tmp_path / "f.h5"
+    save_responses({"x": random_response(0)}, path)
+    assert load_band(path) is None
+    save_responses({"x": random_response(0)}, path, BAND)
+    found = load_band(path)
+    assert found is not None
+    np.testing.assert_array_equal(found.frequencies, BAND.frequencies)
+    np.testing.assert_array_equal(found.relative_std, BAND.relative_std)
+
+
+@pytest.mark.parametrize("signature", [b"TREE", b"HEAP", b"SNOD"])
+@pytest.mark.parametrize("read", [load_responses, load_band])
+def test_a_file_whose_inner_structure_is_not_whole_is_refused(  # type: ignore[no-untyped-def]
+    tmp_path: Path, read, signature: bytes
+) -> None:
+    """Each node of its trees of names, one after the other: what can be read is, the rest is said."""
+    path = tmp_path / "f.h5"
+    save_responses({"x": random_response(0), "y": random_response(1)}, path, BAND)
+    whole = path.read_bytes()
+    refused, at = 0, whole.find(signature)
+    assert at > 0
+    while at > 0:
+        path.write_bytes(whole[:at] + b"0000" + whole[at + 4 :])
+        refused += in_words(lambda: read(path), FileFormatError) is None
+        at = whole.find(signature, at + 1)
+    assert refused
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("frequencies", np.zeros(0)),
+        ("frequencies", np.linspace(0.0, 8.0, 9)),
+        ("frequencies", np.full(9, 3.0)),
+        ("frequencies", np.arange(1.0, 9.0)),
+        ("relative_std", np.zeros((8, 2, 2))),
+    ],
+)
+def test_a_band_that_is_none_is_refused(tmp_path: Path, name: str, values: np.ndarray) -> None:
+    path = tmp_path / "f.h5"
+    save_responses({"x": random_response(0)}, path, BAND)
+    with h5py.File(path, "r+") as file:
+        del file["band"][name]
+        file["band"][name] = values
+    with pytest.raises(FileFormatError, match="contradicts itself"):
+        load_band(path)

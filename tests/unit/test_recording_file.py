@@ -20,6 +20,7 @@ from fieldtool.records.recording import (
     RecordingWriter,
     Segment,
     load,
+    recorded_seconds,
     save,
 )
 from tests.seeds import fresh_seed
@@ -192,8 +193,38 @@ def test_a_heap_without_end_is_refused_and_holds_nobody_up(tmp_path: Path) -> No
         at += 16 + (size + 7) // 8 * 8
     content[at + 8 : at + 16] = bytes(8)
     path.write_bytes(content)
-    with pytest.raises(FileFormatError, match=r"is damaged .*heap without end at byte"):
-        load(path)
+    for read in (load, recorded_seconds):
+        with pytest.raises(FileFormatError, match=r"is damaged .*heap without end at byte"):
+            read(path)
+
+
+def test_a_text_of_an_unknown_kind_is_refused_and_kills_nobody(tmp_path: Path) -> None:
+    """One changed byte in the type of an attribute; the HDF5 library itself would not survive it."""
+    text, unknown = bytes.fromhex("190101001000"), bytes.fromhex("19eb01001000")
+    path = tmp_path / "r.h5"
+    save(random_recording(5, 1), path)
+    whole = path.read_bytes()
+    at, files = whole.find(text), []
+    while at >= 0:
+        files.append(tmp_path / f"{at}.h5")
+        files[-1].write_bytes(whole[:at] + unknown + whole[at + len(unknown) :])
+        at = whole.find(text, at + 1)
+    assert len(files) > 10
+    program = (
+        "import sys\nfrom pathlib import Path\nfrom fieldtool.errors import FileFormatError\n"
+        "from fieldtool.records.recording import load\n"
+        "for file in sys.argv[1:]:\n"
+        "    try:\n        load(Path(file))\n"
+        "    except FileFormatError:\n        print('refused')\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program, *map(str, files)],
+        check=False,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == ["refused"] * len(files)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="needs a limit on the size of files")
@@ -300,6 +331,35 @@ def test_half_a_file_is_refused(tmp_path: Path) -> None:
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     with pytest.raises(FileFormatError, match="not a readable HDF5 file"):
         load(path)
+
+
+def test_the_seconds_of_a_recording_are_those_of_its_rows(tmp_path: Path) -> None:
+    recording = random_recording(fresh_seed())
+    save(recording, tmp_path / "r.h5")
+    rows = sum(e.samples for e in recording.experiments)
+    assert recorded_seconds(tmp_path / "r.h5") == pytest.approx(rows * recording.sample_period)
+
+
+@pytest.mark.parametrize(
+    ("damage", "words"),
+    [
+        (lambda f: f["experiments/0001"].pop("time"), "in /experiments/0001: the dataset 'time'"),
+        (lambda f: _replace(f, "experiments", np.zeros(3)), "the group 'experiments' is missing"),
+        (lambda f: _replace(f["experiments/0000"], "time", np.array(1.0)), "has no rows"),
+        (lambda f: f.attrs.modify("sample_period", np.nan), "are nan s"),
+        (lambda f: f.attrs.modify("sample_period", np.inf), "are inf s"),
+        (lambda f: f.attrs.modify("sample_period", -1.0), "are -"),
+        (lambda f: f.attrs.create("sample_period", "often"), "'sample_period' is no number"),
+        (lambda f: f.attrs.modify("format", "any"), "has the format 'any'"),
+    ],
+)
+def test_a_file_that_can_not_tell_its_seconds_says_why(tmp_path: Path, damage, words: str) -> None:  # type: ignore[no-untyped-def]
+    path = tmp_path / "r.h5"
+    save(random_recording(7), path)
+    with h5py.File(path, "r+") as file:
+        damage(file)
+    with pytest.raises(FileFormatError, match=words):
+        recorded_seconds(path)
 
 
 def _replace(group: h5py.Group, name: str, values: np.ndarray) -> None:

@@ -9,6 +9,7 @@ from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 import yaml
@@ -34,6 +35,7 @@ from fieldtool.report.part_parameters import parameters
 from fieldtool.report.part_verification import verification
 from fieldtool.report.part_wrong import wrong
 from fieldtool.report.section import Plot, Section, Table, Words
+from fieldtool.report.trial_file import AxisTrial, Figures, TrialFile
 from fieldtool.workflow.reporting import material_of, report
 from tests.unit.late_axis import FINE, MODEL, STEP, recorded
 
@@ -223,6 +225,94 @@ def test_a_damaged_file_is_named_and_the_rest_is_shown(session, tmp_path):
     assert report(part).is_file()
 
 
+TRIAL = """format: fieldtool-verification/1
+sentence: The new parameters stood their trial on the machine.
+axes:
+- axis: table
+  unit: rad
+  before: {overshoot: 0.02, settling_time: null}
+  after: {overshoot: 0.01}
+  sensitivity: {after: {frequency: [1.0, 2.0], size: [0.5, .nan]}}
+  curves: {time: [0.0, 0.1], after: [0.0, 1.0]}
+notes: []
+"""
+
+
+def with_trial(session, tmp_path, text):
+    part = tmp_path / "part"
+    shutil.copytree(session[0].path, part)
+    (part / "verification.yaml").write_text(text, encoding="utf-8")
+    return part
+
+
+def test_a_trial_is_shown_and_what_is_no_number_is_a_gap(session, tmp_path):
+    part = with_trial(session, tmp_path, TRIAL)
+    html = report(part).read_text(encoding="utf-8")
+    assert "The new parameters stood their trial on the machine." in html
+    assert '"y":[0.5,null]' in html
+    assert "verification.yaml" not in html
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "said"),
+    [
+        ("x: 2020-13-45", "", "YAML can not build"),
+        ("x: !!int abc", "", "YAML can not build"),
+        ("x: !!timestamp 1", "", "YAML can not build"),
+        ("x: " + "[" * 5000, ":1", "nested too deeply"),
+        ("a: &a [*a]", ":1", "uses a YAML alias"),
+        (TRIAL.replace("- axis: table\n  unit", "- unit"), ":4", "the key 'axis number 1, axis'"),
+        (TRIAL.replace("axes:", "axes: [a]\nrest:"), ":3", "keys with values belong here"),
+        (TRIAL.replace("overshoot: 0.01", "overshoot: much"), ":7", "a number belongs here"),
+        (TRIAL.replace("overshoot: 0.01", "overshoot: .inf"), ":7", "finite"),
+        (TRIAL.replace("time: [0.0,", "time: [2020-01-01,"), ":9", "a number belongs here"),
+        (TRIAL.replace("time: [0.0,", "time: ["), ":9", "not of one length"),
+        (TRIAL.replace("size: [0.5,", "size: ["), ":8", "not of one length"),
+        (TRIAL.replace("cation/1", "cation/2"), ":1", "has to be fieldtool-verification/1"),
+        ("[1, 2]", ":1", "keys with values belong here"),
+        ("", "", "is empty"),
+    ],
+)
+def test_a_damaged_trial_is_named_with_its_line_and_the_rest_is_shown(
+    session, tmp_path, capsys, text, line, said
+):
+    part = with_trial(session, tmp_path, text)
+    (refused,) = [s for s in material_of(SessionFolder(part)).missing if "verification" in s]
+    assert refused.startswith("verification.yaml can not be read: ")
+    assert f"verification.yaml{line}: " in refused
+    assert said in refused
+    with pytest.raises(SystemExit) as ended:
+        main(["report", str(part)])
+    assert ended.value.code == 0, capsys.readouterr().err
+    html = (part / "report.html").read_text(encoding="utf-8")
+    assert "verification.yaml can not be read" in html
+    assert "Measured and modelled responses" in html
+
+
+@pytest.mark.parametrize("content", [b"nothing", b""])
+def test_a_damaged_recording_of_a_trial_is_named(session, tmp_path, content):
+    part = tmp_path / "part"
+    shutil.copytree(session[0].path, part)
+    shutil.copy(part / "recording.h5", part / "verification.h5")
+    seconds = material_of(SessionFolder(part)).trial_seconds
+    assert seconds > 0
+    (part / "verification-2.h5").write_bytes(content)
+    material = material_of(SessionFolder(part))
+    assert material.trial_seconds == seconds
+    assert any("verification-2.h5 can not be read" in sentence for sentence in material.missing)
+    assert report(part).is_file()
+
+
+def test_pictures_with_a_value_of_another_type_are_named(session, tmp_path):
+    part = tmp_path / "part"
+    shutil.copytree(session[0].path, part)
+    with h5py.File(part / "criticism-views.h5", "r+") as file:
+        file["pictures/0000"].attrs["logarithmic"] = 1j
+    material = material_of(SessionFolder(part))
+    assert material.pictures == ()
+    assert any("criticism-views.h5 can not be read" in s for s in material.missing)
+
+
 def test_a_stopped_session_says_how_it_ended(session, tmp_path):
     folder, _ = session
     part = tmp_path / "part"
@@ -378,11 +468,11 @@ def test_before_and_after_have_units_and_a_move_that_ends_in_its_band_settles_at
     part = verification(
         Material(
             "s",
-            documents={
-                "verification": {
-                    "axes": [{"axis": "slide", "unit": "m", "before": None, "after": figures}]
-                }
-            },
+            trial=TrialFile(
+                format="fieldtool-verification/1",
+                sentence="",
+                axes=[AxisTrial(axis="slide", unit="m", after=Figures(**figures))],
+            ),
         )
     )
     table = next(block for block in part.blocks if block.is_a == "table")
