@@ -53,8 +53,11 @@ that slides, and the slowest: below, it creeps."""
 CLEAR = 2.0
 """Times the scatter that a torque has to change the speed by, and that the speed has to change against
 it, to be any proof against a motor: an axis that is held proves nothing."""
+LIKE = 30.0
+"""Steps with a torque like the one that begins a suspicion from which the answer has to be learned: an
+axis that was slow so far, and whose load now swings, answers otherwise than it did."""
 UNCLEAR = 0.2
-"""Logarithm that a cycle without such a torque takes away: what is suspected needs more proof soon."""
+"""Logarithm that a cycle that proves nothing takes away: what is suspected needs more proof soon."""
 MOST = 7.0
 """Logarithm of a likelihoods' ratio that one cycle may count: three of them decide nothing."""
 DECIDES = 28.0
@@ -78,6 +81,8 @@ class Answer:
     """Covariance of the weights, over the square of the scatter."""
     scatter: float = 0.0
     """RMS of what was not told, position units."""
+    learned: float = 0.0
+    """Sum of the squares by which the torques of all steps it was learned from have changed speeds."""
     _guess: FloatArray = field(default_factory=lambda: np.zeros(SIZE))
     _spread: FloatArray = field(default_factory=lambda: np.ones(SIZE))
     _blocks: int = 0
@@ -130,6 +135,8 @@ class Answer:
         if sure and self.weights is None:
             self.scatter = max(self.scatter, sqrt(left / self._count))
         self.weights, self.unsure = (weights if sure else None), inverse
+        torques = weights[PUSHES:]
+        self.learned = float(torques @ self._normal[PUSHES:, PUSHES:] @ torques)
 
 
 class Reversed:
@@ -213,7 +220,9 @@ class Reversed:
         if ratio > 0:
             ratio /= 1 + float(told_from @ answer.unsure @ told_from)
             clear = CLEAR * scatter
-            if abs(torque) < clear or abs(step) < clear or step * torque > 0:
+            held = abs(torque) < clear or abs(step) < clear or step * torque > 0
+            unlike = self.total <= 0 and answer.learned < LIKE * torque**2
+            if held or unlike:
                 ratio = -UNCLEAR
         self.total += max(-MOST, min(MOST, ratio))
         if self.total <= 0:
