@@ -101,6 +101,10 @@ def _read(reader: Reader) -> Picture:
         if x.shape != y.shape or (std is not None and std.shape != y.shape):
             raise one.fault("x, y and std are not of one length.")
         series.append(Series(one.text("label"), x, y, std))
+    categories = reader.texts("categories")
+    for curve in series if categories else ():
+        if not np.all(np.isin(curve.x, np.arange(len(categories)))):
+            raise reader.fault(f"{curve.label}: x is no place among {len(categories)} categories.")
     return Picture(
         reader.text("axis"),
         cast("Kind", kind),
@@ -108,6 +112,6 @@ def _read(reader: Reader) -> Picture:
         reader.text("x"),
         reader.text("y"),
         tuple(series),
-        reader.texts("categories"),
+        categories,
         bool(reader.number("logarithmic")),
     )

@@ -38,7 +38,7 @@ SECTIONS: tuple[Callable[[Material], Section | None], ...] = (
 def page_of(material: Material) -> Page:
     """Return the report of a session, as far as it has come."""
     begun = material.begun
-    when = begun.astimezone().strftime("%d %B %Y, %H:%M") if begun else "date not known"
+    when = begun.strftime("%d %B %Y, %H:%M") if begun else "date not known"
     name = material.machine.name if material.machine else material.name
     description = material.machine.description if material.machine else ""
     if not description and material.recording is not None:

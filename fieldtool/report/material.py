@@ -64,10 +64,10 @@ class Material:
 
     @property
     def begun(self) -> datetime | None:
-        """When the first session of the folder began."""
+        """When the first session of the folder began, in local time."""
         for event in self.events:
             try:
-                return datetime.fromisoformat(str(event.get("time")))
-            except ValueError:
+                return datetime.fromisoformat(str(event.get("time"))).astimezone()
+            except (ValueError, OverflowError, OSError):
                 continue
         return None

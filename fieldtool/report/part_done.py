@@ -16,6 +16,8 @@ KINDS = {
 }
 MOST_EVENTS = 400
 """Events that are shown, the last ones."""
+DEEPEST = 10
+"""Lists and mappings inside each other of which the innermost are shown."""
 
 
 def facts(material: Material) -> tuple[tuple[str, str], ...]:
@@ -36,11 +38,9 @@ def facts(material: Material) -> tuple[tuple[str, str], ...]:
                            f"{machine.bus.bitrate} bit/s"))  # fmt: skip
     elif material.axes:
         out.append(("Axes", ", ".join(material.axes)))
-    drives = {(e.get("axis"), e.get("name")) for e in material.events_of("drive")}
+    drives = {(str(e.get("axis")), str(e.get("name"))) for e in material.events_of("drive")}
     if drives:
-        out.append(
-            ("Drives", "; ".join(f"{axis}: {name}" for axis, name in sorted(drives, key=str)))
-        )
+        out.append(("Drives", "; ".join(f"{axis}: {name}" for axis, name in sorted(drives))))
     if material.recording is not None:
         out.append(("Measured", _measured(material.recording)))
     if material.trial_seconds:
@@ -165,17 +165,19 @@ def _details(event: Event) -> str:
     return "; ".join(parts)
 
 
-def _plain(value: Any) -> str:
+def _plain(value: Any, depth: int = 0) -> str:
+    if depth > DEEPEST:
+        return "..."
     if isinstance(value, Mapping):
-        return ", ".join(f"{k} {_plain(v)}" for k, v in value.items() if v is not None)
+        return ", ".join(f"{k} {_plain(v, depth + 1)}" for k, v in value.items() if v is not None)
     if isinstance(value, list):
-        return ", ".join(_plain(v) for v in value) or "none"
+        return ", ".join(_plain(v, depth + 1) for v in value) or "none"
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def _clock(event: Event) -> str:
     try:
-        time = datetime.fromisoformat(str(event.get("time")))
-    except ValueError:
+        time = datetime.fromisoformat(str(event.get("time"))).astimezone()
+    except (ValueError, OverflowError, OSError):  # no time, or none of this computer's calendar
         return str(event.get("time"))
-    return time.astimezone().strftime("%Y-%m-%d %H:%M:%S")
+    return time.strftime("%Y-%m-%d %H:%M:%S")

@@ -72,7 +72,7 @@ def _rows(material: Material) -> list[Mapping[str, Any]]:
 
 def _designed_since(tuning: Tuning, rows: Sequence[Mapping[str, Any]]) -> bool:
     """Whether the tuning has other values than were written, beyond what drives round."""
-    written = {(row.get("axis"), row.get("name")): row.get("after") for row in rows}
+    written = {(str(row.get("axis")), str(row.get("name"))): row.get("after") for row in rows}
     for axis in tuning.axes:
         for name, value in axis.parameters.items():
             other = written.get((axis.axis, name))

@@ -27,6 +27,8 @@ from fieldtool.workflow.models import is_simulated, prior_model, truth_model
 from fieldtool.workflow.rescued import rescue
 
 LARGEST_LOG = 64 * 1024 * 1024
+LONGEST_NUMBER = 300
+"""Digits of a whole number that is not beyond all others."""
 T = TypeVar("T")
 
 
@@ -150,6 +152,13 @@ def _prior(machine: MachineProfile | None) -> MachineModel | None:
         return None
 
 
+def _whole(digits: str) -> int:
+    """Return a whole number that can be shown and compared; raise ValueError if it is too large."""
+    if len(digits) > LONGEST_NUMBER:
+        raise ValueError
+    return int(digits)
+
+
 def _events(path: Path) -> tuple[tuple[Mapping[str, Any], ...], int]:
     """Read the log; return its events, and how many lines are none.
 
@@ -162,7 +171,7 @@ def _events(path: Path) -> tuple[tuple[Mapping[str, Any], ...], int]:
     out = []
     for line in lines:
         try:
-            event = json.loads(line)
+            event = json.loads(line, parse_int=_whole)
         except (ValueError, RecursionError):
             continue
         if isinstance(event, dict):

@@ -20,7 +20,7 @@ from fieldtool.cli.main import main
 from fieldtool.criticise.criticise import criticise
 from fieldtool.criticise.criticism_file import read_criticism
 from fieldtool.criticise.pictured import pictures_of
-from fieldtool.criticise.pictures_file import NOISE_ONLY, load_pictures, save_pictures
+from fieldtool.criticise.pictures_file import NOISE_ONLY, Series, load_pictures, save_pictures
 from fieldtool.design.tuning import AxisTuning, Tuning
 from fieldtool.errors import FileFormatError
 from fieldtool.records.model import Estimate
@@ -28,6 +28,7 @@ from fieldtool.records.model_file import write_model
 from fieldtool.records.recording import save
 from fieldtool.records.session_folder import SessionFolder
 from fieldtool.records.yaml_file import write_yaml
+from fieldtool.report.contents import page_of
 from fieldtool.report.figures import log_ticks
 from fieldtool.report.material import Material
 from fieldtool.report.page import Page, html_of
@@ -37,6 +38,7 @@ from fieldtool.report.part_wrong import wrong
 from fieldtool.report.section import Plot, Section, Table, Words
 from fieldtool.report.trial_file import AxisTrial, Figures, TrialFile
 from fieldtool.workflow.reporting import material_of, report
+from tests.fuzzed import changed, places
 from tests.unit.late_axis import FINE, MODEL, STEP, recorded
 
 HOSTILE = "</script><script>alert(1)</script> \"'><img src=x onerror=alert(2)> {{7*7}} & \u2028"
@@ -311,6 +313,52 @@ def test_pictures_with_a_value_of_another_type_are_named(session, tmp_path):
     material = material_of(SessionFolder(part))
     assert material.pictures == ()
     assert any("criticism-views.h5 can not be read" in s for s in material.missing)
+
+
+@pytest.mark.parametrize("x", [[3.0, 99.0], [np.nan], [-1.0], [0.5]])
+def test_pictures_of_places_that_are_not_there_are_named(session, tmp_path, x):
+    one = replace(
+        load_pictures(session[0].views)[0],
+        series=(Series("error", np.array(x), np.zeros(len(x))),),
+        categories=("a", "b", "c", "d"),
+    )
+    part = tmp_path / "part"
+    shutil.copytree(session[0].path, part)
+    save_pictures((one,), part / "criticism-views.h5")
+    material = material_of(SessionFolder(part))
+    assert material.pictures == ()
+    assert any("no place among 4 categories" in s for s in material.missing)
+
+
+@pytest.mark.parametrize(
+    "value",
+    [[1], {"a": 1}, None, 1e999, True, 10**200, 10**3000, json.loads("[" * 300 + "]" * 300), "\u2028",
+     "0001-01-01T00:00:00+23:59", "9999-12-31T23:59:59-23:59", -1],
+    ids=lambda value: str(value)[:8],
+)  # fmt: skip
+def test_events_with_any_values_are_shown_or_counted(session, tmp_path, value):
+    """Each value of each kind of event, one after the other."""
+    part = tmp_path / "part"
+    shutil.copytree(session[0].path, part)
+    tuning = Tuning((AxisTuning("table", {"velocity_p": 4.2}, 1.5, "why"),))
+    whole = {
+        "session": {"command": "run", "options": {"plan": "fast"}},
+        "drive": {"axis": "table", "name": "epos4"},
+        "parameters": {"rows": [{"axis": "table", "name": "velocity_p", "before": 1, "after": 3}]},
+        "write": {"written": True, "stored": False},
+        "warning": {"text": "none"},
+        "ended": {"error": "X", "text": "stopped"},
+    }
+    lines = []
+    for kind, held in whole.items():
+        event = {"time": "2026-11-27T09:00:00+00:00", "event": kind, **held}
+        ways = [where for where in places(event) if where]
+        lines += [json.dumps(changed(event, way, value, "replace")) for way in ways]
+    (part / "events.jsonl").write_text("\n".join(lines) + "\n")
+    material = replace(material_of(SessionFolder(part)), tuning=tuning)
+    counted = sum("lines that are no events" in sentence for sentence in material.missing)
+    assert len(material.events) == len(lines) or counted
+    assert "<html" in html_of(page_of(material))
 
 
 def test_a_stopped_session_says_how_it_ended(session, tmp_path):
