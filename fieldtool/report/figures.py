@@ -33,6 +33,8 @@ MOST_DECADES = 7
 """Powers of ten that are labelled; of more, every second or third."""
 SMALLEST_PLAIN = 1e-3
 """Smaller numbers are labelled as powers of ten, and larger ones than its inverse."""
+NEXT_TO_NOTHING = 1e-300
+"""Smaller numbers, and larger ones than its inverse, have no labels."""
 WIDEST = 5.0
 """Natural logarithm of the largest factor that a band shows."""
 FAINTEST = 1e-7
@@ -150,7 +152,7 @@ def log_ticks(axis: Figure, values: FloatArray) -> None:
     Powers of ten alone where the values range over many decades; one to nine of each where over less
     than one.
     """
-    shown = values[np.isfinite(values) & (values > 0)]
+    shown = values[(values > NEXT_TO_NOTHING) & (values < 1 / NEXT_TO_NOTHING)]
     if not shown.size:
         return
     low, high = np.log10(shown.min()), np.log10(shown.max())

@@ -511,6 +511,18 @@ def test_a_logarithmic_axis_has_labels_that_are_numbers_of_their_own(span):
     assert seen >= 2 or high - low < 0.35
 
 
+@pytest.mark.parametrize("odd", [5e-324, 1e-305, 1.7e308, np.inf, np.nan, 0.0, -1.0])
+def test_numbers_at_the_end_of_all_numbers_have_no_labels(odd):
+    axis, alone = {}, {}
+    log_ticks(axis, np.array([odd, 1.0, 30.0]))
+    assert (
+        axis["ticktext"]
+        == ["1", "2", "5", "10", "20", "50", "100", "200", "500"][: len(axis["tickvals"])]
+    )
+    log_ticks(alone, np.array([odd]))
+    assert alone == {}
+
+
 def test_before_and_after_have_units_and_a_move_that_ends_in_its_band_settles_at_once():
     figures = {"settling_time": 0.0, "overshoot": 0.012, "peak_torque": 3.5}
     part = verification(
