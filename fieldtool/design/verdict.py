@@ -19,8 +19,8 @@ SLOWER = 1.05
 CYCLES = 3.0
 """Cycles of the bus by which times may differ besides: no time is known better."""
 RINGS = 1.5
-"""Times the old vibration, and the old overshoot, or those predicted, that the new ones may have; half
-the band about the target counts as nothing."""
+"""Times the old vibration, and the old overshoot, or those that an identified model predicts, that the
+new ones may have; half the band about the target counts as nothing."""
 LEAST_PEAK = 0.5
 """No loop's sensitivity stays below it over a band that reaches far above its bandwidth (Bode's
 integral): where it seems to, the torque that was told did not follow the excitation."""
@@ -95,7 +95,8 @@ def faults(
     bound
         That was designed for: of the peak of sensitivity.
     believed
-        Whether the prediction rests on an identified model; it is not judged by where it does not.
+        Whether the prediction rests on an identified model; where it does not, nothing is judged, and
+        nothing excused, by it.
     softer
         Whether a softer machine was asked for: then an axis whose old parameters do not keep the bound
         may settle later, as predicted.
@@ -112,7 +113,7 @@ def faults(
         peak = before.sensitivity_peak
         later = softer and believed and peak is not None and peak > MARGIN * bound
         found += _unmeasured(before, "old", sensitivity=False)
-        found += _worse(one, before, after, np.inf if later else cycle)
+        found += _worse(one, before, after, np.inf if later else cycle, believed)
     if believed and one.predicted is None:
         found.append("nothing was predicted of it, so nothing says that it is as designed")
     elif believed and one.predicted is not None:
@@ -159,7 +160,9 @@ def _margins(one: Comparison, after: AxisFigures, bound: float) -> list[str]:
     return found
 
 
-def _worse(one: Comparison, before: AxisFigures, after: AxisFigures, cycle: float) -> list[str]:
+def _worse(
+    one: Comparison, before: AxisFigures, after: AxisFigures, cycle: float, believed: bool
+) -> list[str]:
     found = []
     longest = SLOWER * before.settling_time + CYCLES * cycle
     if after.settling_time > longest and np.isfinite(after.settling_time):
@@ -169,7 +172,7 @@ def _worse(one: Comparison, before: AxisFigures, after: AxisFigures, cycle: floa
         )
     for what, name in (("overshoots", "overshoot"), ("vibrates after its move", "vibration")):
         new, old = getattr(after, name), getattr(before, name)
-        expected = getattr(one.predicted, name) if one.predicted else 0.0
+        expected = getattr(one.predicted, name) if believed and one.predicted else 0.0
         if new > RINGS * max(old, expected) + one.band / 2:
             found.append(
                 f"{what} by {new:.3g} {one.unit}, {old:.3g} {one.unit} with the old parameters"
