@@ -28,7 +28,7 @@ from fieldtool.criticise.search.judge import Parts
 from fieldtool.criticise.search.machine import Machine
 from fieldtool.criticise.search.marks import Unmarked
 from fieldtool.criticise.search.prepare import Prepared, prepare
-from fieldtool.criticise.search.rules import LEFT
+from fieldtool.criticise.search.rules import LEFT, NO_MORE
 from fieldtool.criticise.search.search import Advance, Found, search
 from fieldtool.criticise.simulate.inverse import needed_torque
 from fieldtool.criticise.simulate.structure import Structure
@@ -55,6 +55,8 @@ STRONG = 0.01
 """Of the power of the strongest line of a motion: lines that units are judged by."""
 OTHER_UNIT = 5.0
 """Factor between measured and needed torque from which it is no fault of the machine."""
+NOTHING_UNSEEN = "there are no unseen data of it, so no cause of it can be shown"
+"""Of an axis of whose torque the unseen data tell nothing."""
 FLAT = 0.02
 """Share of rows at one largest torque from which it is said that the drive was at its limit."""
 
@@ -122,7 +124,8 @@ def criticise(
     causes = tuple(_cause(found, a, recording) for a in found.accepted)
     held = _held_out(found)
     zeros = _false_zeros(found)
-    verdict = _verdict(causes, held, zeros)
+    verdict = _verdict(causes, held, zeros, after)
+    untold = frozenset(n for n, e in held.error_after.items() if e.torque is None)
     return Criticised(
         Criticism(
             verdict=verdict,
@@ -130,7 +133,7 @@ def criticise(
             causes=causes,
             unexplained=(
                 *(
-                    e.sentence
+                    f"{e.sentence}; {NOTHING_UNSEEN}" if e.axis in untold else e.sentence
                     for e in after
                     if verdict != "adequate" and _matters(e.error, e.noise)
                 ),
@@ -139,14 +142,17 @@ def criticise(
             ),
             held_out=held,
             rejected=tuple(
-                Rejected(e.name, _axis(recording.names, e), e.location, why)
+                _rejected(e, _axis(recording.names, e), why, untold)
                 for e, why in found.rejected
                 if why
             ),
             changes=() if prior is None else change_sentences(prior, model),
             model=extended_model(found, recording.names),
             band=(0.0, prepared.spans.top),
-            notes=_notes(recording, found),
+            notes=(
+                *_notes(recording, found),
+                *(_untold(e) for e in after if e.axis in untold and not e.hidden),
+            ),
         ),
         found,
         before,
@@ -322,6 +328,14 @@ def _evidence(torque: float, p: float, blocks: int, effect: Effect) -> str:
     )
 
 
+def _rejected(
+    effect: Effect, axis: str | tuple[str, str], why: str, untold: frozenset[str]
+) -> Rejected:
+    if why == NO_MORE and untold.issuperset(np.atleast_1d(axis).tolist()):
+        why = NOTHING_UNSEEN
+    return Rejected(effect.name, axis, effect.location, why)
+
+
 def _unmarked(found: Found, one: Unmarked) -> str:
     """Say what would fit, by its numbers and its signature, and why it has no name."""
     effect, mark = one.effect, one.mark
@@ -389,22 +403,38 @@ def _false_zeros(found: Found) -> dict[str, str]:
     return said
 
 
-def _verdict(causes: Sequence[Cause], held: HeldOut, zeros: Mapping[str, str]) -> Verdict:
+def _untold(error: AxisError) -> str:
+    return (
+        f"{error.axis}: the unseen data tell nothing of its torque; it is judged by data that fits have "
+        "seen, and no cause of it can be shown. Another experiment of the same motion would test it."
+    )
+
+
+def _verdict(
+    causes: Sequence[Cause], held: HeldOut, zeros: Mapping[str, str], after: Sequence[AxisError]
+) -> Verdict:
+    """Judge what is left on unseen data; of an axis that these say nothing of, on all data.
+
+    There nothing is explained, whatever a fit makes of it.
+    """
     names = list(held.error_before)
-    errors = {n: held.error_after[n].torque or 0.0 for n in names}
-    left = {n for n in names if _matters(errors[n], held.noise_floor[n])}
+    errors, noises = {e.axis: e.error for e in after}, {e.axis: e.noise for e in after}
+    for n, error in held.error_after.items():
+        if error.torque is not None:
+            errors[n], noises[n] = error.torque, held.noise_floor[n]
+    left = {n for n in names if _matters(errors[n], noises[n])}
     if not causes:
         return "unexplained" if left else "adequate"
     # Beside a cause that has a name even little counts: it may be of another cause than of that one.
     of_axis = {n: [c for c in causes if n in c.axes] for n in names}
     left |= {
         n
-        for n, noise in held.noise_floor.items()
+        for n, noise in noises.items()
         if noise is not None and errors[n] > NEAR_NOISE * noise and of_axis[n]
     }
     for n in left:
         sure = all(LIBRARY[c.effect].exact for c in of_axis[n])
-        enough = ENOUGH if held.noise_floor[n] is None else ENOUGH_SURE if sure else ENOUGH_KNOWN
+        enough = ENOUGH if noises[n] is None else ENOUGH_SURE if sure else ENOUGH_KNOWN
         if held.explained[n] < enough:
             return "partly explained"
     return "partly explained" if any(of_axis[n] for n in zeros) else "explained"

@@ -67,7 +67,8 @@ class SignalError:
     """RMS of measured minus simulated over RMS of measured, of one axis."""
 
     torque: float | None
-    """None where the encoder hides at all frequencies what torque the motion needs."""
+    """None where no line of it can be compared: the axis is still, or its encoder hides at all
+    frequencies what torque its motion needs."""
     position: float
 
 

@@ -1,6 +1,6 @@
 """The first sentence of a report: what matters, for people who read no further."""
 
-from fieldtool.criticise.criticism import Criticism
+from fieldtool.criticise.criticism import Criticism, HeldOut
 from fieldtool.report.material import Material
 from fieldtool.report.words import cause_words, listed, percent
 
@@ -44,16 +44,18 @@ def verdict(material: Material) -> tuple[str, str]:
 
 def _of(criticism: Criticism) -> str:
     held = criticism.held_out
-    worst = max(held.error_before, key=lambda n: held.error_before[n].torque or 0.0, default="")
-    if not worst:
-        return f"The verdict is: {MEANING[criticism.verdict]}."
+    told = [n for n, error in held.error_before.items() if error.torque is not None]
+    worst = max(told, key=lambda n: held.error_before[n].torque or 0.0, default="")
+    untold = "".join(f" {sentence}." for sentence in _untold(criticism))
+    if not worst or (untold and not criticism.causes):
+        return f"The verdict is: {MEANING[criticism.verdict]}.{untold or _still(held)}"
     before, after = held.error_before[worst].torque, held.error_after[worst].torque
     noise = held.noise_floor[worst]
     beyond = "" if noise is None else f" (noise {percent(noise)})"
     if criticism.verdict == "adequate":
         return (
             f"The simulation does as the machine does: at most {percent(after)} of the torque of unseen "
-            f"data is not explained{beyond}, which is noise or does not matter."
+            f"data is not explained{beyond}, which is noise or does not matter.{_still(held)}"
         )
     if not criticism.causes:
         return (
@@ -68,8 +70,21 @@ def _of(criticism: Criticism) -> str:
     partly = " in part" if criticism.verdict == "partly explained" else ""
     return (
         f"The simulation was wrong by {percent(before)} of the torque of {worst}; {named} {how} "
-        f"it{partly}: with it, {percent(after)} is left{beyond}.{ties}"
+        f"it{partly}: with it, {percent(after)} is left{beyond}.{ties}{untold}"
     )
+
+
+def _untold(criticism: Criticism) -> tuple[str, ...]:
+    """Return what is unexplained of axes that the unseen data say nothing of."""
+    errors = criticism.held_out.error_before
+    axes = tuple(f"{name}: " for name, error in errors.items() if error.torque is None)
+    return tuple(s for s in criticism.unexplained if s.startswith(axes))
+
+
+def _still(held: HeldOut) -> str:
+    """Say which axes the unseen data say nothing of."""
+    axes = [name for name, error in held.error_before.items() if error.torque is None]
+    return f" They say nothing of {listed(axes)}." if axes else ""
 
 
 def _stopped(material: Material) -> str:

@@ -96,6 +96,10 @@ def tolerance(gain: Comparison, sure: bool = False) -> float:
     return min(ALIKE_SHARE * explained, (ALIKE_LEFT_SURE if sure else ALIKE_LEFT) * gain.after)
 
 
+NO_MORE = "explains no more of the unseen data than chance would"
+"""Why most candidates get no name."""
+
+
 @dataclass(frozen=True)
 class Tried:
     """One candidate, fitted, and what it does on unseen data."""
@@ -139,7 +143,7 @@ def why_not(tried: Tried, context: Context, known_noise: bool, level: float, fur
         Whether the axis has a cause already.
     """
     if tried.gain.p > (CHANCE_OF_MOST if tried.share >= MOST else CHANCE):
-        return "explains no more of the unseen data than chance would"
+        return NO_MORE
     if tried.beyond < BEYOND_NOISE and tried.effect.name != "periodic_disturbance":
         return "there is nothing beyond the noise that it could explain"
     least = LEAST_SHARE
