@@ -199,6 +199,11 @@ def _tuning(result: _Result, response: str) -> Tuning:
                 f"{side.axis}: the largest that its drive holds: {', '.join(most)}. More would serve: "
                 "choose other units or ranges in the drive."
             )
+        if k not in kept and (least := side.smallest(parameters)):
+            notes.append(
+                f"{side.axis}: one step of its drive, which holds nothing between this and 0: "
+                f"{', '.join(least)}. Less may serve better: choose finer units in the drive."
+            )
         if side.missing:
             notes.append(
                 f"{side.axis}: its drive profile has no {', '.join(side.missing)} that can be written; "

@@ -2,19 +2,25 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from math import inf, isfinite, nan
+from math import inf, isclose, isfinite, nan
 
 from drives.units import Kind, unit_on
+from fieldtool.design.rule import DesignError
 from fieldtool.design.servo import Servo, Timing, servo_from_parameters
 
 GAINS = ("position_p", "velocity_p", "velocity_i")
 PID = ("pid_p", "pid_i", "pid_d")
+ABOVE_ZERO = ("position_p", "velocity_p", "pid_p", "pid_d")
+"""Gains that no loop goes without: what rounds to 0 is one step of the drive's."""
 FILTERS = (1, 2)
 CAUTIOUS = Timing()
 UNITS = {
     "position_p": "1/s",
     "velocity_p": "N m s/rad",
     "velocity_i": "N m/rad",
+    "pid_p": "N m/rad",
+    "pid_i": "N m/(rad s)",
+    "pid_d": "N m s/rad",
     "inertia_ff": "kg m2",
     "velocity_filter": "Hz",
     **{f"filter{k}_frequency": "Hz" for k in FILTERS},
@@ -38,25 +44,47 @@ class Hold:
     """Bounds of the physical value."""
 
     def nearest(self, value: float) -> float:
-        """Return the physical value next to one that is wanted, within all bounds."""
-        value = min(max(value, self.minimum), self.maximum)
+        """Return the physical value next to one that is wanted, within all bounds.
+
+        Where no whole number is within the bounds of the physical value, one beside them.
+        """
+        value = self._inside(value)
         if self.power < 0 and value == 0:
             return 0.0
         held = (value / self.scale) ** self.power
-        if self.whole:
-            held = float(round(held))
-        held = min(max(held, self.low), self.high)
+        near = (float(round(held) + k) for k in (0, -1, 1)) if self.whole else [held]
+        values = [self._physical(min(max(one, self.low), self.high)) for one in near]
+        for one in values:
+            if isclose(one, self._inside(one), rel_tol=1e-9):
+                return self._inside(one)  # rounding up must not leave the range
+        return values[0]
+
+    def above_zero(self, value: float) -> float:
+        """Return the same, but one step of the drive where that is 0."""
+        found = self.nearest(value)
+        return found if found > 0 or not self.whole else self.nearest(self.scale)
+
+    def _physical(self, held: float) -> float:
         if self.power < 0 and held == 0:
             return 0.0
         return self.scale * held**self.power
 
+    def _inside(self, value: float) -> float:
+        return min(max(value, self.minimum), self.maximum)
+
     @property
     def bounds(self) -> tuple[float, float]:
         """Smallest and largest physical value."""
-        low, high = (
-            (self.scale * self.low, self.scale * self.high) if self.power > 0 else (-inf, inf)
+        if self.power < 0:
+            return self.minimum, self.maximum
+        low = max(self.scale * self.low, self.minimum)
+        high = min(self.scale * self.high, self.maximum)
+        if not self.whole:
+            return low, high
+        return (
+            self.nearest(low) if isfinite(low) else low,
+            self.nearest(high) if isfinite(high) else high,
         )
-        return max(low, self.minimum), min(high, self.maximum)
 
 
 @dataclass(frozen=True)
@@ -98,45 +126,112 @@ class DriveSide:
         """Gains that a design has and the drive can not be told: for a person to enter."""
         return tuple(name for name in GAINS if not self.has(name))
 
+    def hold_of(self, name: str) -> Hold | None:
+        """Return how the drive holds a parameter; None: any number.  A PID's D is the velocity's P."""
+        whole = name == "velocity_p" and self.is_pid
+        return self.holds.get("pid_d" if whole else name)
+
+    @property
+    def is_pid(self) -> bool:
+        """Whether the drive's loop is one PID."""
+        return all(name in self.holds for name in PID)
+
+    def check_gains(self) -> None:
+        """Refuse a drive that holds nothing above 0 of a gain that no loop goes without.
+
+        Raises
+        ------
+        DesignError
+            If it is one.
+        """
+        for name in ABOVE_ZERO:
+            if name in self.holds and not self.holds[name].bounds[1] > 0:
+                raise DesignError(
+                    f"{self.axis}: its drive holds no {name} above 0, so there is no loop to design; "
+                    "nothing is written. Choose other units or ranges in the drive."
+                )
+
     def held(self, parameters: Mapping[str, float]) -> dict[str, float]:
         """Return parameters as the drive will hold them.
 
         Those of a drive whose loop is one PID come back as the cascade that the rounded PID is.
+
+        Raises
+        ------
+        DesignError
+            If the PIDs that such a drive can hold are no cascade, or it holds no gains above 0.
         """
+        self.check_gains()
+        told = self._told(parameters)
         rounded = {
-            name: self.holds[name].nearest(value) if name in self.holds else value
-            for name, value in parameters.items()
+            name: self._nearest(name, value) if name in self.holds else value
+            for name, value in told.items()
         }
-        if not all(name in self.holds for name in PID):
+        if not all(name in rounded for name in PID):
             return rounded
-        kp, kv, ki = (parameters[name] for name in GAINS)
-        wanted = dict(zip(PID, (kv * kp + ki, ki * kp, kv), strict=True))
-        p, i, d = (self.holds[name].nearest(value) for name, value in wanted.items())
-        hold = self.holds["pid_i"]
-        while i > 0 and p * p < 4 * i * d:  # no cascade is that: less integral is one
-            i = max(hold.nearest(min(i - hold.scale, 0.999 * i)), 0.0)
+        p, i, d = (rounded.pop(name) for name in PID)
+        i = self._integral(p, i, d)
         root = max(p * p - 4 * i * d, 0.0) ** 0.5
         larger = (p + root) / 2
         return rounded | dict(zip(GAINS, (larger / d, d, p - larger), strict=True))
 
+    def _nearest(self, name: str, value: float) -> float:
+        hold = self.holds[name]
+        return hold.above_zero(value) if name in ABOVE_ZERO else hold.nearest(value)
+
+    def _integral(self, p: float, i: float, d: float) -> float:
+        """Return I, or less of it where a PID with this I is no cascade: P^2 >= 4 I D."""
+        if p * p >= 4 * i * d:
+            return i
+        hold, most = self.holds["pid_i"], 0.999 * p * p / (4 * d)
+        for wanted in (most, most - hold.scale):  # rounded up it may be too much
+            less = hold.nearest(max(wanted, 0.0))
+            if p * p >= 4 * less * d:
+                return less
+        raise DesignError(
+            f"{self.axis}: the least I that its drive holds ({self.words('pid_i', less)}) is too much "
+            f"for P {self.words('pid_p', p)} and D {self.words('pid_d', d)}: no position P and "
+            "velocity PI are that PID. Nothing is written. Choose other units or ranges in the drive."
+        )
+
+    def _told(self, parameters: Mapping[str, float]) -> dict[str, float]:
+        """Return parameters with the PID that the drive is told in place of the cascade's gains."""
+        if not self.is_pid or any(name not in parameters for name in GAINS):
+            return dict(parameters)
+        kp, kv, ki = (parameters[name] for name in GAINS)
+        others = {name: value for name, value in parameters.items() if name not in GAINS}
+        return others | dict(zip(PID, (kv * kp + ki, ki * kp, kv), strict=True))
+
     def out_of_range(self, parameters: Mapping[str, float]) -> list[str]:
         """Return what does not fit into the drive, a phrase each."""
+        told = self._told(parameters)
         return [
-            f"{name} {self.words(name, parameters[name])} (the drive holds {low:.4g} to "
+            f"{name} {self.words(name, told[name])} (the drive holds {low:.4g} to "
             f"{self.words(name, high)})"
             for name, hold in self.holds.items()
-            if name in parameters
+            if name in told
             for low, high in [hold.bounds]
-            if not low <= parameters[name] <= high
+            if not low <= told[name] <= high
         ]
 
     def largest(self, parameters: Mapping[str, float]) -> list[str]:
         """Return gains and inertia fed forward that are the most that the drive holds, a phrase each."""
+        told = self._told(parameters)
         return [
-            f"{name} {self.words(name, parameters[name])}"
-            for name in (*GAINS, "inertia_ff")
-            if name in parameters and name in self.holds
-            if parameters[name] >= (1 - 1e-6) * self.holds[name].bounds[1]
+            f"{name} {self.words(name, told[name])}"
+            for name in (*GAINS, *PID, "inertia_ff")
+            if name in told and name in self.holds
+            if told[name] >= (1 - 1e-6) * self.holds[name].bounds[1]
+        ]
+
+    def smallest(self, parameters: Mapping[str, float]) -> list[str]:
+        """Return gains of one step of the drive, the least that make a loop, a phrase each."""
+        told = self._told(parameters)
+        return [
+            f"{name} {self.words(name, told[name])}"
+            for name in ABOVE_ZERO
+            if name in told and name in self.holds and self.holds[name].whole
+            if told[name] <= (1 + 1e-6) * self.holds[name].above_zero(0.0)
         ]
 
     def servo(self, parameters: Mapping[str, float]) -> Servo:

@@ -62,7 +62,7 @@ class Space:
 
     def _range(self, name: str) -> tuple[float, float]:
         """Return the logarithm of what the drive holds."""
-        hold = self.side.holds.get(name)
+        hold = self.side.hold_of(name)
         if hold is None:
             return -np.inf, np.inf
         low, high = hold.bounds

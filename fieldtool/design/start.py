@@ -6,7 +6,7 @@ from math import inf
 
 import numpy as np
 
-from fieldtool.design.drive_side import GAINS, PID, DriveSide
+from fieldtool.design.drive_side import GAINS, DriveSide
 from fieldtool.design.machine import Machine
 from fieldtool.design.robust import stable_on_all
 from fieldtool.design.rule import DesignError, rule
@@ -39,8 +39,10 @@ def plain_start(
     Raises
     ------
     DesignError
-        If there are none.
+        If there are none, or a drive holds none.
     """
+    for side in sides:
+        side.check_gains()
     modes = np.concatenate([machines[0].modes, machines[0].held_modes])
     lowest = 0.3 * float(modes.min()) if modes.size else 2 * np.pi
     ruled = rule(model)
@@ -74,8 +76,7 @@ def _begin(loop: AxisLoop, axis: AxisModel, side: DriveSide, lowest: float, top:
     highest = 0.8 * np.pi / (side.timing.period or 1e-4)
     space = Space(side, axis.total_mass, (), lowest, min(highest, HIGHEST * top))
     present = side.present or {}
-    whole = all(name in side.holds for name in PID)
-    share = 1.0 if side.has("velocity_ff") or whole else present.get("velocity_ff", 0.0)
+    share = 1.0 if side.has("velocity_ff") or side.is_pid else present.get("velocity_ff", 0.0)
     inertia = axis.total_mass if side.has("inertia_ff") else present.get("inertia_ff", 0.0)
     servo = side.servo(
         {"position_p": 1.0, "velocity_p": 1.0, "velocity_i": 1.0}

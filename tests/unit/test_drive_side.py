@@ -1,0 +1,111 @@
+"""What a drive can hold: steps and ranges at once, and the PID that a cascade becomes."""
+
+from math import floor, inf, isclose
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fieldtool.design.decide import design
+from fieldtool.design.drive_side import GAINS, PID, DriveSide, Hold
+from fieldtool.design.rule import DesignError
+from fieldtool.records.model import AxisModel, Estimate, MachineModel
+
+NAMES = frozenset({*PID, *GAINS, "inertia_ff"})
+
+
+def rigid(mass: float) -> MachineModel:
+    return MachineModel((AxisModel("x", "rotary", (Estimate(mass, 0.01 * mass),), (), ()),))
+
+
+def pid_side(hold: Hold, torque: float = 5.0) -> DriveSide:
+    return DriveSide("x", NAMES, torque_limit=torque, holds=dict.fromkeys(PID, hold))
+
+
+def pid_of(parameters: dict[str, float]) -> tuple[float, float, float]:
+    kp, kv, ki = (parameters[name] for name in GAINS)
+    return kv * kp + ki, ki * kp, kv
+
+
+@pytest.mark.parametrize(
+    ("hold", "wanted", "held"),
+    [
+        (Hold(1.0, whole=True, maximum=10.6), 10.6, 10.0),
+        (Hold(1.0, whole=True, maximum=10.6), 1e9, 10.0),
+        (Hold(1.0, whole=True, minimum=9.4), 9.4, 10.0),
+        (Hold(0.1, whole=True, maximum=0.3), 5.0, 0.3),
+        (Hold(1.0, -1, whole=True, low=1, high=100, maximum=0.4), 0.4, 1 / 3),
+    ],
+)
+def test_rounding_stays_inside_of_the_range(hold: Hold, wanted: float, held: float) -> None:
+    assert hold.nearest(wanted) == held
+    assert hold.minimum <= hold.nearest(wanted) <= hold.maximum
+
+
+@given(st.floats(1e-3, 1e3), st.floats(-50.0, 50.0), st.floats(0.0, 60.0), st.floats(-100.0, 100.0))
+def test_what_is_held_is_the_step_inside_of_the_range_that_is_next(scale, low, width, wanted):
+    """Against all steps there are."""
+    hold = Hold(scale, whole=True, minimum=low * scale, maximum=(low + width) * scale)
+    inside = [n for n in range(floor(low), floor(low + width) + 1) if low <= n <= low + width]
+    found = hold.nearest(wanted * scale) / scale
+    assert isclose(found, round(found), rel_tol=1e-6, abs_tol=1e-6) or not inside
+    if inside:
+        assert low - 1e-6 <= found <= low + width + 1e-6
+        assert abs(found - wanted) <= min(abs(n - wanted) for n in inside) + 1e-6
+
+
+def test_bounds_of_whole_numbers_are_what_can_be_held() -> None:
+    assert Hold(1.0, whole=True, low=0, high=100, minimum=0.4, maximum=10.6).bounds == (1.0, 10.0)
+    assert Hold(maximum=10.6).bounds == (-inf, 10.6)
+
+
+def test_a_gain_never_rounds_to_no_loop() -> None:
+    side = pid_side(Hold(0.01, whole=True, low=0, high=1e4))
+    held = side.held({"position_p": 20.0, "velocity_p": 0.004, "velocity_i": 0.05})
+    assert held["velocity_p"] == pytest.approx(0.01)
+    p, i, d = pid_of(held)
+    assert [n / 0.01 for n in (p, i, d)] == pytest.approx([13.0, 42.0, 1.0])
+    cascade = DriveSide("x", holds={"velocity_p": Hold(0.5, whole=True, low=0, high=9)})
+    assert cascade.held({"velocity_p": 0.1})["velocity_p"] == 0.5
+
+
+def test_an_integral_that_no_cascade_has_becomes_the_most_that_one_has() -> None:
+    side = pid_side(Hold(0.01, whole=True, low=0, high=1e4))
+    p, i, d = pid_of(side.held({"position_p": 4.0, "velocity_p": 0.004, "velocity_i": 0.016}))
+    assert (p, d) == pytest.approx((0.03, 0.01))
+    assert i == pytest.approx(0.02), "P^2 / 4 D = 0.0225"
+    real = pid_side(Hold(1.0, maximum=0.03))
+    p, i, d = pid_of(real.held({"position_p": 4.0, "velocity_p": 0.01, "velocity_i": 0.04}))
+    assert i == pytest.approx(p * p / (4 * d), rel=2e-3)
+
+
+def test_an_integral_that_can_not_be_little_enough_is_said() -> None:
+    holds = dict.fromkeys(PID, Hold(0.01, whole=True, low=4, high=4))
+    holds["pid_i"] = Hold(0.01, whole=True, low=10, high=90)
+    with pytest.raises(DesignError, match=r"x: the least I that its drive holds .* is too much"):
+        DriveSide("x", holds=holds).held(dict.fromkeys(GAINS, 0.1))
+
+
+def test_a_small_motor_on_a_drive_of_coarse_steps_is_designed_and_said() -> None:
+    side = pid_side(Hold(0.002, whole=True, low=0, high=1e5), 0.1)
+    tuning = design(rigid(1e-5), [side])
+    assert tuning.axes[0].parameters["velocity_p"] == pytest.approx(0.002)
+    assert any("one step of its drive" in n and "pid_d 0.002 N m s/rad" in n for n in tuning.notes)
+
+
+@pytest.mark.parametrize(
+    ("hold", "said"),
+    [
+        (Hold(1e-6, whole=True, low=0, high=1000), r"too small: x: pid_p .* holds 0 to 0\.001"),
+        (Hold(0.2, whole=True, low=0, high=0), "x: its drive holds no pid_p above 0"),
+        (Hold(40.0, whole=True, low=0, high=1e6), "x: .* its steps are too coarse"),
+    ],
+)
+def test_a_pid_that_does_not_fit_is_said_by_what_the_drive_is_told(hold: Hold, said: str) -> None:
+    with pytest.raises(DesignError, match=said):
+        design(rigid(0.05), [pid_side(hold)])
+
+
+def test_a_pid_at_the_end_of_its_range_is_said() -> None:
+    tuning = design(rigid(0.05), [pid_side(Hold(0.001, whole=True, low=0, high=1e4))])
+    assert any("the largest that its drive holds: pid_p 10 N m/rad" in n for n in tuning.notes)
