@@ -19,8 +19,8 @@ from fieldtool.criticise.criticism import (
 from fieldtool.criticise.effects import LIBRARY
 from fieldtool.criticise.effects.base import Context, Effect
 from fieldtool.criticise.evidence.position import position_error
-from fieldtool.criticise.evidence.spans import Spans
 from fieldtool.criticise.extension import extended_model
+from fieldtool.criticise.notes import notes_of
 from fieldtool.criticise.numbers import numbers_of
 from fieldtool.criticise.search.afterwards import FALSE_ZERO, Accepted
 from fieldtool.criticise.search.fit import Fitted
@@ -57,8 +57,6 @@ OTHER_UNIT = 5.0
 """Factor between measured and needed torque from which it is no fault of the machine."""
 NOTHING_UNSEEN = "there are no unseen data of it, so no cause of it can be shown"
 """Of an axis of whose torque the unseen data tell nothing."""
-FLAT = 0.02
-"""Share of rows at one largest torque from which it is said that the drive was at its limit."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,7 +148,7 @@ def criticise(
             model=extended_model(found, recording.names),
             band=(0.0, prepared.spans.top),
             notes=(
-                *_notes(recording, found),
+                *notes_of(recording, found.prepared),
                 *(_untold(e) for e in after if e.axis in untold and not e.hidden),
             ),
         ),
@@ -438,54 +436,6 @@ def _verdict(
         if held.explained[n] < enough:
             return "partly explained"
     return "partly explained" if any(of_axis[n] for n in zeros) else "explained"
-
-
-def _notes(recording: Recording, found: Found) -> tuple[str, ...]:
-    spans = found.prepared.spans
-    notes = []
-    if spans.split == "time":
-        seconds = sum(s.stop - s.start for s in spans.spans if s.role == "unseen")
-        notes.append(
-            "There are no experiments of a kind twice, so the data are cut in time: "
-            f"{seconds * recording.sample_period:.3g} s are kept unseen, in {_stretches(spans)}."
-        )
-    if any(s.periods < 2 for s in spans.spans):
-        why = (
-            "No stretch that is compared holds a period twice"
-            if any(e.period for e in recording.experiments if e.kind == "multisine")
-            else "The excitation does not repeat"
-        )
-        notes.append(
-            f"{why}, so the noise is not known: what is not explained may in part be noise."
-        )
-    for k, axis in enumerate(recording.axes):
-        if axis.controller is None:
-            notes.append(
-                f"{axis.name}: the recording states no controller; the error of its position is that in "
-                "open loop, at excited frequencies."
-            )
-        share = _flat_share(found, k)
-        if share > FLAT:
-            notes.append(
-                f"{axis.name}: its torque is at the same largest value in {100 * share:.0f} % of the "
-                "rows: the drive was at its limit there."
-            )
-    return tuple(notes)
-
-
-def _stretches(spans: Spans) -> str:
-    count = sum(s.role == "unseen" for s in spans.spans)
-    return "one stretch" if count == 1 else f"{count} stretches"
-
-
-def _flat_share(found: Found, axis: int) -> float:
-    flat = rows = 0
-    for m in found.prepared.motions.values():
-        torque = m.torque[:, axis]
-        at = np.abs(torque) >= 0.999 * np.abs(torque).max()
-        flat += int(np.sum(at[1:] & at[:-1]))
-        rows += torque.size
-    return flat / max(rows, 1)
 
 
 def context_of(criticised: Criticised) -> Context:

@@ -81,7 +81,7 @@ class HeldOut:
     error_before: Mapping[str, SignalError]
     error_after: Mapping[str, SignalError]
     noise_floor: Mapping[str, float | None]
-    """Of the torque, in the same measure; None where no period repeats."""
+    """Of the torque, in the same measure; None where no period repeats, or there is no torque."""
     explained: Mapping[str, float]
     """Share of the power of the error that could be explained (noise taken off) that is now."""
 

@@ -75,8 +75,9 @@ def test_one_experiment_is_cut_in_time_and_the_noise_is_said_to_be_unknown(good,
 
 
 def test_a_drive_at_its_limit_is_noticed(good, criticise):
+    limit = 0.6 * np.max([np.abs(e.torque).max(axis=0) for e in good.experiments], axis=0)
+
     def clipped(e):
-        limit = 0.6 * np.abs(e.torque).max(axis=0)
         return replace(e, torque=np.clip(e.torque, -limit, limit))
 
     code, out, _ = criticise(changed(good, clipped), *criticise.model)

@@ -62,10 +62,10 @@ def b_only_once(friction, rng):
 @pytest.mark.parametrize(
     ("make", "axis", "friction"), [(one_move, "x", 3.0), (b_only_once, "b", 8.0)]
 )
-def test_what_no_unseen_data_test_is_no_reason_to_call_a_model_adequate(make, axis, friction):
-    seed = int(np.random.default_rng().integers(1 << 30))
-    print("seed", seed)
-    criticism = criticise(*make(friction, np.random.default_rng(seed))).criticism
+def test_what_no_unseen_data_test_is_no_reason_to_call_a_model_adequate(
+    make, axis, friction, fresh_rng
+):
+    criticism = criticise(*make(friction, fresh_rng)).criticism
     assert criticism.held_out.error_before[axis].torque is None
     assert criticism.verdict == "unexplained"
     (sentence,) = [s for s in criticism.unexplained if s.startswith(f"{axis}: ")]
@@ -77,10 +77,10 @@ def test_what_no_unseen_data_test_is_no_reason_to_call_a_model_adequate(make, ax
     assert "not known" not in words
 
 
-def test_without_an_error_such_an_axis_is_adequate_and_the_report_says_what_is_not_tested():
-    seed = int(np.random.default_rng().integers(1 << 30))
-    print("seed", seed)
-    criticism = criticise(*b_only_once(0.0, np.random.default_rng(seed))).criticism
+def test_without_an_error_such_an_axis_is_adequate_and_the_report_says_what_is_not_tested(
+    fresh_rng,
+):
+    criticism = criticise(*b_only_once(0.0, fresh_rng)).criticism
     assert criticism.verdict == "adequate"
     assert any(
         n.startswith("b: the unseen data tell nothing of its torque") for n in criticism.notes

@@ -192,6 +192,8 @@ def torque_candidates(context: Context) -> list[Effect]:
         ]
         if len(context.axes) > 1:
             out.append(TorqueScale(axis, (Parameter("scale", "1", 1.0, 0.2, 5.0, 0.02),)))
+        if not largest > 0.0:
+            continue  # a drive that reports nothing reaches no limit
         out += [
             TorqueSaturation(
                 axis,

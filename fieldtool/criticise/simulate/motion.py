@@ -142,7 +142,7 @@ def _counted(velocity: FloatArray, noise: FloatArray, corner: float, step: float
     """Find the rows in which each axis moves for sure, (n, M)."""
     spread = velocity_noise(noise, np.full_like(noise, corner), step)
     fastest = np.quantile(np.abs(velocity), 0.99, axis=0)
-    slow = np.abs(velocity) < np.maximum(UNSURE * spread, STOPPED * fastest)
+    slow = np.abs(velocity) <= np.maximum(UNSURE * spread, STOPPED * fastest)
     slow[1:] |= slow[:-1].copy()
     slow[:-1] |= slow[1:].copy()
     # A passage through zero between two rows is slow as well.

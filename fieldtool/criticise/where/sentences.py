@@ -1,6 +1,6 @@
 """Where the simulation is wrong, in plain sentences, with the numbers that pictures show."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,6 +20,8 @@ CHANGED = 1.6
 """Ratio of the errors of early and late data from which it is said that something changed."""
 GROWS = 0.3
 """Exponent by which the relative error grows or falls with the amplitude, from which it is said."""
+NO_POWER = 1e-100
+"""Power of an error, SI units, that is none."""
 SIMPLE = (
     "direction",
     "one frequency",
@@ -79,10 +81,13 @@ def axis_errors(context: Context, parts: Parts) -> tuple[AxisError, ...]:
         views = views_of(context, axis)
         band = _band(parts, axis)
         if not any(np.any(lines.weight[:, axis] > 0.0) for lines, _ in parts):
-            sentence = (
-                f"{info.name}: nothing can be said of its torque: at all frequencies its encoder's "
-                "steps or noise hide what torque its motion needs; larger motions would show it"
+            why = (
+                "at all frequencies its encoder's steps or noise hide what torque its motion needs; "
+                "larger motions would show it"
+                if any(_moves(lines, axis) for lines, _ in parts)
+                else "it stands still in all that is compared"
             )
+            sentence = f"{info.name}: nothing can be said of its torque: {why}"
             out.append(AxisError(info.name, error, noise, views, band, sentence, hidden=True))
             continue
         out.append(
@@ -93,15 +98,22 @@ def axis_errors(context: Context, parts: Parts) -> tuple[AxisError, ...]:
 
 
 def relative_error(parts: Parts, axis: int) -> float:
-    """RMS of the error over RMS of the torque in the band, of some spans."""
-    return _root(parts, axis, lambda lines, values: np.abs(_raw(lines, values, axis)) ** 2)
+    """RMS of the error over RMS of the torque in the band, of some spans.
+
+    Beside a torque that is exactly 0 it is 1, or 0 where there is no error either.
+    """
+    lost, whole = _powers(parts, axis, lambda lines, values: np.abs(_raw(lines, values, axis)) ** 2)
+    return float(np.sqrt(lost / whole)) if whole > 0.0 else float(lost > NO_POWER)
 
 
 def relative_noise(parts: Parts, axis: int) -> float | None:
     """RMS of the noise over RMS of the torque in the band; None where it is not known."""
     if not all(lines.span.periods > 1 for lines, _ in parts):
         return None
-    return _root(parts, axis, lambda lines, _: lines.noise[:, axis] * (lines.weight[:, axis] > 0))
+    lost, whole = _powers(
+        parts, axis, lambda lines, _: lines.noise[:, axis] * (lines.weight[:, axis] > 0)
+    )
+    return float(np.sqrt(lost / whole)) if whole > 0.0 else None
 
 
 def experiment_errors(parts: Parts) -> tuple[LevelError, ...]:
@@ -141,13 +153,20 @@ def line_kinds(parts: Parts) -> LineKinds | None:
     return LineKinds(*(tuple(row.tolist()) for row in shares))
 
 
-def _root(parts: Parts, axis: int, power: object) -> float:
+def _powers(
+    parts: Parts, axis: int, power: Callable[[Lines, FloatArray], FloatArray]
+) -> tuple[float, float]:
+    """Return the power of an error or noise, and that of the torque, in the band."""
     lost = whole = 0.0
     for lines, values in parts:
-        lost += float(np.sum(power(lines, values)))  # type: ignore[operator]
+        lost += float(np.sum(power(lines, values)))
         torque = lines.raw(lines.motion.torque)[:, axis]
         whole += float(np.sum(np.abs(torque) ** 2))
-    return float(np.sqrt(lost / max(whole, 1e-300)))
+    return lost, whole
+
+
+def _moves(lines: Lines, axis: int) -> bool:
+    return bool(np.any(lines.motion.counted[lines.span.start : lines.span.stop, axis] > 0.0))
 
 
 def _raw(lines: Lines, values: FloatArray, axis: int) -> FloatArray:
