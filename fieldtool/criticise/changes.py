@@ -2,9 +2,9 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import isfinite, sqrt
+from math import isfinite, nan, sqrt
 
-from fieldtool.records.model import Estimate, MachineModel
+from fieldtool.records.model import AxisModel, Estimate, MachineModel
 
 SURE = 3.0
 """Standard errors from which a number has changed."""
@@ -13,6 +13,9 @@ MATTERS = 0.02
 SAME_FACTOR = 0.02
 """Spread of the factors of all numbers of one axis, within which they changed together."""
 
+MASSES = "masses"
+"""What changed where a chain has another length."""
+
 
 @dataclass(frozen=True)
 class Change:
@@ -20,7 +23,8 @@ class Change:
 
     axis: str
     what: str
-    """``mass 1``, ``spring 2``, ``damper 1``, ``viscous friction``, or ``coupling`` (of two axes)."""
+    """``mass 1``, ``spring 2``, ``damper 1``, ``viscous friction``, ``load friction``, ``coupling``
+    of two axes; of chains of other lengths ``masses`` (how many), ``total inertia``, ``total mass``."""
     before: float
     now: float
     std: float
@@ -32,81 +36,110 @@ class Change:
         """Now over before."""
         return self.now / self.before if self.before else float("inf")
 
+    @property
+    def words(self) -> str:
+        """``mass 2 4.1 -> 5.6 kg m2``, ``2 masses -> 3``."""
+        if self.what == MASSES:
+            return f"{self.before:.0f} {'mass' if self.before == 1 else 'masses'} -> {self.now:.0f}"
+        return f"{self.what} {self.before:.4g} -> {self.now:.4g} {self.unit}"
+
 
 def changes(before: MachineModel, now: MachineModel) -> tuple[Change, ...]:
     """Return what changed beyond its uncertainty, masses first.
 
-    Numbers whose standard errors are not known in either model are compared by their size alone.
+    Numbers whose standard errors are not known in either model are compared by their size alone.  Of
+    chains of other lengths the numbers of masses and their sums are compared.
     """
     out: list[Change] = []
     for old in before.axes:
         new = next((axis for axis in now.axes if axis.name == old.name), None)
-        if new is None:
-            continue
-        units = _units(old.kind)
+        if new is not None:
+            out += _of_chain(old, new)
+    kinds = {axis.name: axis.kind for axis in (*before.axes, *now.axes)}
+    held, found = _by_axes(before), _by_axes(now)
+    for axes in held | found:
+        a, b = (m.get(axes, Estimate(0.0)) for m in (held, found))
+        if _changed(a, b):
+            pair = next(c.axes for c in (*now.couplings, *before.couplings) if axes == {*c.axes})
+            ends = {kinds[name] for name in pair}
+            unit = _units(kinds[pair[0]])["mass"] if len(ends) == 1 else "kg m"
+            out.append(Change(" - ".join(pair), "coupling", a.value, b.value, _std(a, b), unit))
+    return tuple(out)
+
+
+def _of_chain(old: AxisModel, new: AxisModel) -> list[Change]:
+    units = _units(old.kind)
+    pairs = [
+        (f"{what} {k + 1}", a, b, units[what])
         for what, one, other in (
             ("mass", old.masses, new.masses),
             ("spring", old.springs, new.springs),
             ("damper", old.dampers, new.dampers),
-        ):
-            if len(one) == len(other):
-                out += [
-                    Change(old.name, f"{what} {k + 1}", a.value, b.value, _std(a, b), units[what])
-                    for k, (a, b) in enumerate(zip(one, other, strict=True))
-                    if _changed(a, b)
-                ]
-        a, b = old.viscous_friction, new.viscous_friction
-        if _changed(a, b):
-            out.append(
-                Change(old.name, "viscous friction", a.value, b.value, _std(a, b), units["damper"])
-            )
-    held = {frozenset(c.axes): c for c in before.couplings}
-    for c in now.couplings:
-        was = held.get(frozenset(c.axes))
-        a, b = Estimate(was.value if was else 0.0), Estimate(c.value, c.std)
-        if _changed(a, b):
-            kind = next(axis.kind for axis in now.axes if axis.name == c.axes[0])
-            unit = _units(kind)["mass"]
-            out.append(Change(" - ".join(c.axes), "coupling", a.value, b.value, _std(a, b), unit))
-    return tuple(out)
+        )
+        if len(one) == len(other)
+        for k, (a, b) in enumerate(zip(one, other, strict=True))
+    ]
+    counts = len(old.masses), len(new.masses)
+    out = []
+    if counts[0] != counts[1]:
+        out.append(Change(old.name, MASSES, *counts, nan, ""))
+        total = "total inertia" if old.kind == "rotary" else "total mass"
+        pairs = [(total, _total(old), _total(new), units["mass"])]
+    pairs += [
+        ("viscous friction", old.viscous_friction, new.viscous_friction, units["damper"]),
+        ("load friction", old.load_friction, new.load_friction, units["damper"]),
+    ]
+    out += [
+        Change(old.name, what, a.value, b.value, _std(a, b), unit)
+        for what, a, b, unit in pairs
+        if _changed(a, b)
+    ]
+    return out
+
+
+def _total(axis: AxisModel) -> Estimate:
+    """Sum of an axis' masses, whose errors are taken for independent."""
+    return Estimate(axis.total_mass, sqrt(sum(m.std**2 for m in axis.masses)))
+
+
+def _by_axes(model: MachineModel) -> dict[frozenset[str], Estimate]:
+    return {frozenset(c.axes): Estimate(c.value, c.std) for c in model.couplings}
 
 
 def change_sentences(before: MachineModel, now: MachineModel) -> tuple[str, ...]:
     """Say what changed, and what did not, one sentence an axis."""
     found = changes(before, now)
-    out = []
-    for axis in before.axes:
-        mine = [c for c in found if c.axis == axis.name]
-        firm = [c for c in mine if c.what.startswith(("mass", "spring"))]
-        count = len(axis.masses) + len(axis.springs)
-        if not mine:
-            out.append(f"{axis.name}: unchanged since it was last accepted.")
-            continue
-        words = ", ".join(f"{c.what} {c.before:.4g} -> {c.now:.4g} {c.unit}" for c in mine)
-        sentence = f"{axis.name}: {words}"
-        factor = _together(firm, count)
-        if factor is not None:
-            sentence += (
-                f"; all its masses and springs changed by the same factor of {factor:.4g}: as of a "
-                "wrong scale of the torque. The motor's data sheet (motor_inertia) tells both apart"
-            )
-        elif len(firm) < count:
-            rest = [
-                name
-                for name in (
-                    *(f"mass {k + 1}" for k in range(len(axis.masses))),
-                    *(f"spring {k + 1}" for k in range(len(axis.springs))),
-                )
-                if name not in {c.what for c in firm}
-            ]
-            sentence += f"; {', '.join(rest)} unchanged"
-        out.append(sentence + ".")
-    out += [
-        f"{c.axis}: coupling {c.before:.4g} -> {c.now:.4g} {c.unit}."
-        for c in found
-        if c.what == "coupling"
+    out = [
+        f"{axis.name}: {_chain_words(axis, [c for c in found if c.axis == axis.name])}."
+        for axis in before.axes
+        if axis.name in now.names
     ]
+    out += [f"{c.axis}: {c.words}." for c in found if c.what == "coupling"]
     return tuple(out)
+
+
+def _chain_words(axis: AxisModel, mine: Sequence[Change]) -> str:
+    if not mine:
+        return "unchanged since it was last accepted"
+    words = ", ".join(c.words for c in mine)
+    if mine[0].what == MASSES:
+        return words.replace(", ", "; ", 1)
+    firm = [c for c in mine if c.what.startswith(("mass", "spring"))]
+    count = len(axis.masses) + len(axis.springs)
+    factor = _together(firm, count)
+    if factor is not None:
+        return (
+            f"{words}; all its masses and springs changed by the same factor of {factor:.4g}: as of a "
+            "wrong scale of the torque. The motor's data sheet (motor_inertia) tells both apart"
+        )
+    if len(firm) == count:
+        return words
+    names = (
+        *(f"mass {k + 1}" for k in range(len(axis.masses))),
+        *(f"spring {k + 1}" for k in range(len(axis.springs))),
+    )
+    rest = [name for name in names if name not in {c.what for c in firm}]
+    return f"{words}; {', '.join(rest)} unchanged"
 
 
 def _together(found: Sequence[Change], count: int) -> float | None:
