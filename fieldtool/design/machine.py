@@ -8,12 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import eigh
 
+from fieldtool.design.rule import DesignError
 from fieldtool.records.model import FloatArray, MachineModel
 
 ComplexArray = NDArray[np.complexfloating[Any, Any]]
 DRY = ("coulomb_friction", "stribeck_friction", "asymmetric_friction")
 RIGID = 1e-9
 """Of the largest eigenvalue: below it a mode is rigid motion."""
+SINGULAR = 1e-12
+"""Smallest eigenvalue of the masses' matrix with a diagonal of 1 that a machine has at least."""
 
 
 @dataclass(frozen=True)
@@ -96,11 +99,16 @@ def machine_of(model: MachineModel) -> Machine:
     asymmetric_friction`` (its viscous part), ``torque_scale, torque_lag, measurement_delay`` are in;
     the others have no linear part (:mod:`fieldtool.design.nonlinear` says what they do).  Dry friction
     stands beside the matrices.
+
+    Raises
+    ------
+    DesignError
+        If inertia between axes is more than their masses allow.
     """
     m = len(model.axes)
-    parts = _Parts(model)
-    for effect in model.effects:
-        parts.add(effect)
+    parts = _parts_of(model)
+    if not _positive(parts.mass):
+        raise DesignError(_too_coupled(model))
     return Machine(
         model.names,
         parts.mass,
@@ -113,6 +121,34 @@ def machine_of(model: MachineModel) -> Machine:
         np.maximum(parts.of_axis("torque_lag", "time", 0.0, m), 0.0),
         np.maximum(parts.of_axis("measurement_delay", "delay", 0.0, m), 0.0),
         tuple(dry for effect in model.effects if (dry := _dry(model, effect)) is not None),
+    )
+
+
+def is_machine(model: MachineModel) -> bool:
+    """Return whether a model's masses, with the inertia of its effects, are those of a machine."""
+    return _positive(_parts_of(model).mass)
+
+
+def _positive(mass: FloatArray) -> bool:
+    """Return whether masses are positive definite, whatever their sizes and units."""
+    size = np.diag(mass)
+    if not np.all(size > 0):
+        return False
+    root = np.sqrt(size)
+    return float(np.linalg.eigvalsh(mass / np.outer(root, root))[0]) > SINGULAR
+
+
+def _too_coupled(model: MachineModel) -> str:
+    named = [
+        f"{number(e, 'inertia'):.4g} of {' - '.join(e['axis'])} at the "
+        f"{'motors' if e.get('location') == 'motor' else 'last masses'}"
+        for e in model.effects
+        if e.get("effect") == "coupling_inertia"
+    ]
+    return (
+        "the model's mass matrix is not positive definite with its effects (coupling_inertia "
+        f"{', '.join(named) or 'none'}): no machine is that, and nothing is written. Correct the "
+        "coupling, or the masses that it joins, in model.yaml, or measure and criticise anew."
     )
 
 
@@ -163,6 +199,13 @@ def spring_of(model: MachineModel, effect: Mapping[str, Any]) -> tuple[int, int]
     return axis, max(min(place, last), 0)
 
 
+def _parts_of(model: MachineModel) -> "_Parts":
+    parts = _Parts(model)
+    for effect in model.effects:
+        parts.add(effect)
+    return parts
+
+
 class _Parts:
     """Matrices that grow with the effects."""
 
@@ -209,8 +252,8 @@ class _Parts:
     def _mass(self, axis: str, effect: Mapping[str, Any]) -> int:
         k = self.model.names.index(axis)
         at_motor = effect.get("location") == "motor"
-        if effect.get("effect") in ("coupling_spring", "coupling_inertia"):
-            at_motor = False  # they join last masses
+        if effect.get("effect") == "coupling_spring":
+            at_motor = False  # it joins last masses
         elif effect.get("effect") == "asymmetric_friction":
             at_motor = effect.get("location") != "load"
         places = self.model.first_masses if at_motor else self.model.last_masses

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from fieldtool.design.machine import spring_of
+from fieldtool.design.machine import is_machine, spring_of
 from fieldtool.records.model import Correlation, Estimate, MachineModel
 
 FURTHEST = 2.5
@@ -30,7 +30,7 @@ def samples_of(model: MachineModel, count: int, rng: np.random.Generator) -> lis
 
     Errors hang together as the model's correlation says, and are independent where it says nothing.
     Masses and springs are drawn in their logarithm, so that none becomes negative; couplings so
-    that the mass matrix stays positive definite.
+    that the mass matrix, with its effects, stays positive definite.
     """
     return [_drawn(model, rng) for _ in range(count)]
 
@@ -69,7 +69,7 @@ def _with_spring(model: MachineModel, effect: Mapping[str, Any], factor: float) 
 def _drawn(model: MachineModel, rng: np.random.Generator) -> MachineModel:
     for _ in range(TRIES):
         drawn = model.with_numbers(_numbers(model, rng))
-        if np.linalg.eigvalsh(drawn.mass_matrix)[0] > 0:
+        if is_machine(drawn):
             return drawn
     return model
 

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from drives.errors import UserStopError
 from drives.profile import load_machine
@@ -187,14 +188,15 @@ def final_model(found: Criticised, model: MachineModel) -> MachineModel:
 
     Where the identification had the same effects, its numbers stand: it uses all data at once.
     """
-    had = {(e.get("effect"), e.get("axis")) for e in model.effects}
+    had = {_place(str(e.get("effect")), e.get("axis"), e.get("location")) for e in model.effects}
     had |= {
-        ("viscous_friction", axis.name)
+        _place("viscous_friction", axis.name, None)
         for axis in model.axes
         if axis.viscous_friction.value != 0.0 or axis.load_friction.value != 0.0
     }
-    had |= {("coupling_inertia", c.axes) for c in model.couplings}
-    new = [c for c in found.criticism.causes if (c.effect, c.axis) not in had]
+    had |= {_place("coupling_inertia", c.axes, "load") for c in model.couplings}
+    causes = found.criticism.causes
+    new = [c for c in causes if _place(c.effect, c.axis, c.location) not in had]
     extended = found.criticism.model
     if not new:
         return model
@@ -202,6 +204,12 @@ def final_model(found: Criticised, model: MachineModel) -> MachineModel:
         e.std < KNOWN * e.value for axis in extended.axes for e in (*axis.masses, *axis.springs)
     )
     return extended if known else replace(model, effects=extended.effects)
+
+
+def _place(effect: str, axis: Any, location: str | None) -> tuple[str, frozenset[str], str]:
+    """Return what tells an effect from others: a coupling of motors is none of last masses."""
+    axes = frozenset([axis] if isinstance(axis, str) else axis or ())
+    return effect, axes, "motor" if (effect, location) == ("coupling_inertia", "motor") else ""
 
 
 def alike(prior: MachineModel | None, model: MachineModel) -> MachineModel | None:

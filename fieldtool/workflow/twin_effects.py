@@ -76,7 +76,7 @@ def rebuilt(effects: tuple[Mapping[str, Any], ...], chains: Chains) -> Rebuilt:
         name, axis = str(effect["effect"]), effect.get("axis")
         values = {k: _value(v) for k, v in effect["parameters"].items()}
         if not isinstance(axis, str):
-            _between(out, name, tuple(axis or ()), values)
+            _between(out, effect, tuple(axis or ()), values)
             continue
         kind, springs = chains[axis]
         given = Given(
@@ -102,7 +102,10 @@ def _value(number: Any) -> float:
     return float(number["value"] if isinstance(number, Mapping) else number)
 
 
-def _between(out: Rebuilt, name: str, axes: tuple[str, ...], values: Mapping[str, float]) -> None:
+def _between(
+    out: Rebuilt, effect: Mapping[str, Any], axes: tuple[str, ...], values: Mapping[str, float]
+) -> None:
+    name = str(effect["effect"])
     if name == "coupling_spring" and values.get("stiffness", 0.0) > 0:
         out.between.append({"effect": name, "axes": list(axes), "stiffness": values["stiffness"]})
     elif name == "coupling_inertia" and "inertia" in values:
@@ -110,7 +113,7 @@ def _between(out: Rebuilt, name: str, axes: tuple[str, ...], values: Mapping[str
             "effect": name,
             "axes": list(axes),
             "inertia": values["inertia"],
-            "location": "load",
+            "location": "motor" if effect.get("location") == "motor" else "load",
         }
         out.between.append(part)
     else:
