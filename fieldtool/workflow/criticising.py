@@ -1,9 +1,11 @@
 """Criticise what was measured: from a session folder or a recording to a criticism."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Set
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from drives.errors import UserStopError
 from drives.profile import load_machine
@@ -26,8 +28,14 @@ from fieldtool.workflow.rescued import rescue
 from fieldtool.workflow.session import Session
 
 Advance = Callable[[str, float], None]
+Place = tuple[str, frozenset[str], str]
 LIGHTER = 0.5
 """Of the motor's inertia: all masses of an axis together can not be less."""
+SAME = (
+    frozenset({"coulomb_friction", "stribeck_friction", "asymmetric_friction"}),
+    frozenset({"measurement_delay", "torque_lag"}),
+)
+"""Effects of which an axis has one: forms of its dry friction, and of what comes late."""
 KNOWN = 0.3
 """Relative standard error up to which a mass or spring of the extended model replaces the old one."""
 
@@ -186,27 +194,60 @@ def keep(folder: SessionFolder, found: Criticised, model: MachineModel) -> None:
 def final_model(found: Criticised, model: MachineModel) -> MachineModel:
     """Return the model that later stages use: extended where criticism found what it has not.
 
-    Where the identification had the same effects, its numbers stand: it uses all data at once.
+    Where the identification had the same effects, its numbers stand: it uses all data at once.  Where
+    masses and springs beside the causes are hardly known, the causes join the model as it is.
     """
     had = {_place(str(e.get("effect")), e.get("axis"), e.get("location")) for e in model.effects}
     had |= {
-        _place("viscous_friction", axis.name, None)
+        _place("viscous_friction", axis.name)
         for axis in model.axes
         if axis.viscous_friction.value != 0.0 or axis.load_friction.value != 0.0
     }
     had |= {_place("coupling_inertia", c.axes, "load") for c in model.couplings}
-    causes = found.criticism.causes
-    new = [c for c in causes if _place(c.effect, c.axis, c.location) not in had]
+    new = {
+        p for c in found.criticism.causes if (p := _place(c.effect, c.axis, c.location)) not in had
+    }
     extended = found.criticism.model
     if not new:
         return model
     known = all(
         e.std < KNOWN * e.value for axis in extended.axes for e in (*axis.masses, *axis.springs)
     )
-    return extended if known else replace(model, effects=extended.effects)
+    return extended if known else _with_causes(model, extended, new)
 
 
-def _place(effect: str, axis: Any, location: str | None) -> tuple[str, frozenset[str], str]:
+def _with_causes(model: MachineModel, extended: MachineModel, new: Set[Place]) -> MachineModel:
+    """Put causes into a model whose masses and springs stay; what they do not replace stays as well."""
+    axes = []
+    for mine, theirs in zip(model.axes, extended.axes, strict=True):
+        axis = mine
+        if _place("viscous_friction", axis.name) in new:
+            axis = replace(axis, load_friction=theirs.load_friction)
+        if any(_place(e, axis.name) in new for e in ("viscous_friction", "asymmetric_friction")):
+            axis = replace(axis, viscous_friction=theirs.viscous_friction)
+        axes.append(axis)
+    kept = [e for e in model.effects if not any(_instead(one, e) for one in extended.effects)]
+    couplings = [c for c in extended.couplings if _place("coupling_inertia", c.axes, "load") in new]
+    joined = replace(
+        model,
+        axes=tuple(axes),
+        couplings=(*model.couplings, *couplings),
+        effects=(*kept, *extended.effects),
+    )
+    # Masses and couplings of two fits may not go together.
+    return joined if np.linalg.eigvalsh(joined.mass_matrix)[0] > 0.0 else extended
+
+
+def _instead(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
+    """Whether an effect is another one, or stands for the same of the same axis."""
+    here, there = (
+        _place(str(e.get("effect")), e.get("axis"), e.get("location")) for e in (one, other)
+    )
+    same = any({here[0], there[0]} <= alike_ones for alike_ones in SAME)
+    return here == there or (same and here[1] == there[1])
+
+
+def _place(effect: str, axis: Any, location: str | None = None) -> Place:
     """Return what tells an effect from others: a coupling of motors is none of last masses."""
     axes = frozenset([axis] if isinstance(axis, str) else axis or ())
     return effect, axes, "motor" if (effect, location) == ("coupling_inertia", "motor") else ""
