@@ -180,6 +180,7 @@ def _decoded_velocity(coded: int, position: float, counts: float) -> float:
 _ON_LINEAR_AXES = {
     "N m s/rad": "N s/m",
     "N m/rad": "N/m",
+    "N m/(rad s)": "N/(m s)",
     "N m": "N",
     "kg m2": "kg",
     "rad": "m",

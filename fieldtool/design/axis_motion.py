@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from fieldtool.design.grids import Bounds, ComplexArray, Grids, closed_compliance, without
 from fieldtool.design.moves import TestMove
 from fieldtool.design.servo import Sampled, Servo
-from fieldtool.design.waves import HalfWave
 from fieldtool.records.model import FloatArray
 
 DISTURBANCE = 0.2
@@ -29,6 +28,9 @@ DURING = 0.05
 """Weight of the following error before the move has ended, for the feed-forward."""
 MOST_FED = np.array([1.0, 1.3])
 """Velocity feed-forward, and inertia feed-forward over the axis' own inertia, at most."""
+ROOM = 1.15
+"""Times the torque of a rigid axis with its friction, where that is above the limit whatever the gains:
+no gains are given up for less."""
 FED_NOISE = 3.0
 """RMS of the torque that rounded targets make by inertia feed-forward, over that allowed of the
 encoder's steps."""
@@ -60,7 +62,12 @@ class AxisMotion:
         self._target = wave.spectrum(wave.move(self.move))
         self._step = wave.spectrum(wave.step(DISTURBANCE * self.mass * self.move.acceleration))
         self._wanted = wave.move(self.move)
-        self._drag = self._dragged(grids, wave, (axis, closed, loads))
+        friction = self._friction(grids, axis)
+        self._drag = self._dragged(friction, (axis, closed, loads))
+        _, _, acceleration = self.move.at(wave.time)
+        least = float(np.abs(self.mass * acceleration + friction).max())
+        self.most_torque = bounds.torque if least <= bounds.torque else ROOM * least
+        """Of the move, N m or N."""
         self._begin = int(np.searchsorted(wave.time, self.move.duration))
         self._weight = np.where(wave.time >= self.move.duration, 1.0, DURING)
         # position = there - back C S, for motor and last mass of every other axis on its own move
@@ -77,8 +84,19 @@ class AxisMotion:
         self._there = np.array(there, dtype=np.complex128).reshape(shape)
         self._back = np.array(back, dtype=np.complex128).reshape(shape)
 
+    def _friction(self, grids: Grids, axis: int) -> FloatArray:
+        """Return the axis' dry friction on the reference, N m or N, in the direction of its velocity."""
+        machine, wave = grids.machines[0], grids.wave
+        torque = sum(
+            0.5 * (dry.forward + dry.backward)
+            for dry in machine.dry
+            if dry.place in (machine.motors[axis], machine.loads[axis])
+        )
+        moving = np.sign(np.round(self.move.at(wave.time)[1] / self.move.velocity, 9))
+        return np.asarray(torque * moving)
+
     def _dragged(
-        self, grids: Grids, wave: HalfWave, inner: tuple[int, ComplexArray, ComplexArray]
+        self, friction: FloatArray, inner: tuple[int, ComplexArray, ComplexArray]
     ) -> ComplexArray | None:
         """Return what the axis' dry friction does to motor and last mass before its loop is closed.
 
@@ -86,16 +104,9 @@ class AxisMotion:
         when the move begins, and to forget when it ends.  None where there is none.
         """
         axis, closed, loads = inner
-        machine = grids.machines[0]
-        torque = sum(
-            0.5 * (dry.forward + dry.backward)
-            for dry in machine.dry
-            if dry.place in (machine.motors[axis], machine.loads[axis])
-        )
-        if torque <= 0:
+        if not friction.any():
             return None
-        moving = np.sign(np.round(self.move.at(wave.time)[1] / self.move.velocity, 9))
-        force = wave.spectrum(-torque * moving)
+        force = self._wave.spectrum(-friction)
         return np.stack([closed[:, axis, axis] * force, loads[:, axis, axis] * force])
 
     def fed_forward(self, servo: Servo) -> Servo:
@@ -154,6 +165,8 @@ class AxisMotion:
         )
         for signal, (wanted, begin, other_band) in zip(moved[2:], self._others, strict=True):
             total += _outside(signal[begin:] - wanted, other_band)
+        if self._drag is not None:  # the loop works against friction too
+            phasors = phasors - self._drag[0] * follow
         return 0.5 * self._tick * total, float(np.abs(wave.signal(phasors)).max())
 
 

@@ -113,7 +113,7 @@ class AxisProblem:
             noise = servo.torque_noise(self.bounds.resolution)
             excess = max(excess, noise / self.bounds.noise - 1)
         settled, torque = self._motion.figures(servo)
-        excess = max(excess, torque / self.bounds.torque - 1)
+        excess = max(excess, torque / self._motion.most_torque - 1)
         return settled + STEEP * self.move.duration * max(excess, 0.0), excess
 
     def fed_forward(self, servo: Servo) -> Servo:

@@ -15,6 +15,7 @@ from fieldtool.design.margins import margins_of
 from fieldtool.design.moves import TestMove, typical_move
 from fieldtool.design.no_worse import no_worse, predicted
 from fieldtool.design.nonlinear import notes_of
+from fieldtool.design.notes import drive_notes
 from fieldtool.design.predict import Prediction, frequencies
 from fieldtool.design.robust import SLACK
 from fieldtool.design.rule import DesignError, check_masses, lowest_antiresonance
@@ -194,26 +195,7 @@ def _tuning(result: _Result, response: str) -> Tuning:
             parameters = {n: v for n, v in side.present.items() if n in parameters}
         reason = KEPT if k in kept else _reason(task, k, servo)
         axes.append(AxisTuning(side.axis, parameters, axis.margins.sensitivity_peak, reason))
-        if k not in kept and (most := side.largest(parameters)):
-            notes.append(
-                f"{side.axis}: the largest that its drive holds: {', '.join(most)}. More would serve: "
-                "choose other units or ranges in the drive."
-            )
-        if k not in kept and (least := side.smallest(parameters)):
-            notes.append(
-                f"{side.axis}: one step of its drive, which holds nothing between this and 0: "
-                f"{', '.join(least)}. Less may serve better: choose finer units in the drive."
-            )
-        if side.missing:
-            notes.append(
-                f"{side.axis}: its drive profile has no {', '.join(side.missing)} that can be written; "
-                "enter the numbers with the maker's software, or complete `parameters` in a drive "
-                "profile of your own."
-            )
-        if side.unreadable:
-            notes.append(
-                f"{side.axis}: its present parameters can not be compared: {side.unreadable}"
-            )
+        notes += drive_notes(side, axis, {} if k in kept else parameters)
     if kept:
         names = ", ".join(task.sides[k].axis for k in sorted(kept))
         notes.append(f"{names}: {KEPT}")
