@@ -53,7 +53,7 @@ that slides, and the slowest: below, it creeps."""
 CLEAR = 2.0
 """Times the scatter that a torque has to change the speed by, and that the speed has to change against
 it, to be any proof against a motor: an axis that is held proves nothing."""
-LIKE = 30.0
+LIKE = 20.0
 """Steps with a torque like the one that begins a suspicion from which the answer has to be learned: an
 axis that was slow so far, and whose load now swings, answers otherwise than it did."""
 UNCLEAR = 0.2

@@ -138,7 +138,7 @@ def separation(
     for k, rival in enumerate(wanted):
         advance(f"fit {rival.effect}", 0.4 + 0.6 * k / len(wanted))
         tried.append(_with(prepared, current, _key(names, rival)))
-    rows = prepared.simulator.residual(tried[0].hypothesis, "fit").size
+    rows = prepared.simulator.degrees("fit")
     misfit = max(1.0, tried[0].cost / max(rows, 1))
     return Separation(recording, model, tried[0], tuple(tried[1:]), rows, misfit)
 

@@ -120,12 +120,10 @@ def cycles_until_told(rng: np.random.Generator, counts: int) -> tuple[int, float
 
 @pytest.mark.parametrize("counts", [60_000, 2**20])
 def test_a_motor_that_is_reversed_in_motion_is_found_before_it_has_gone_far(fresh_rng, counts):
-    """All but the one in forty whose torque is larger than any before just then."""
-    found = [cycles_until_told(fresh_rng, counts) for _ in range(3)]
-    told = [one for one in found if one is not None]
-    assert len(told) >= 2, found
-    for cycles, beside in told:
-        assert abs(beside) < np.radians(6.0), f"{cycles} cycles, {np.degrees(beside):.2f} degrees"
+    told = cycles_until_told(fresh_rng, counts)
+    assert told is not None, "it was never found"
+    cycles, beside = told
+    assert abs(beside) < np.radians(6.0), f"{cycles} cycles, {np.degrees(beside):.2f} degrees"
 
 
 def test_an_axis_that_stops_answering_is_not_called_reversed(fresh_rng):

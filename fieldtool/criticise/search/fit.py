@@ -191,7 +191,8 @@ def fit(
             break
         if gained < RENEWED * promised:
             old = None
-    return _result(current, free, vector, scales, jacobian, known, cost)
+    count = simulator.degrees("fit")
+    return _result(current, free, vector, scales, jacobian, known, cost, count)
 
 
 def strain(fitted: Fitted) -> float:
@@ -262,9 +263,10 @@ def _result(
     jacobian: FloatArray,
     known: FloatArray,
     cost: float,
+    count: int,
 ) -> Fitted:
     # What is known beforehand is as sure as it is, however well the data are explained.
-    level = max(cost / max(jacobian.shape[0] - len(free), 1), 1e-300)
+    level = max(cost / max(count - len(free), 1), 1e-300)
     rows = np.vstack([jacobian / np.sqrt(level), np.diag(known)])
     size = np.linalg.norm(rows, axis=0)
     size[size == 0.0] = 1.0

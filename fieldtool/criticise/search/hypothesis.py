@@ -130,6 +130,11 @@ class Simulator:
         parts = self.parts(hypothesis, role)
         return np.concatenate([values for _, values in parts]) if parts else np.zeros(0)
 
+    def degrees(self, role: Role) -> int:
+        """Return how many rows of :meth:`residual` are free: those of weight, less what is not known."""
+        lines = [one for one in self.lines if one.span.role == role]
+        return sum(2 * np.count_nonzero(one.weight) - one.free.shape[1] for one in lines)
+
     def parts(self, hypothesis: Hypothesis, role: Role) -> list[tuple[Lines, FloatArray]]:
         """Return the weighted error of each span of one role."""
         errors: dict[str, FloatArray] = {}
