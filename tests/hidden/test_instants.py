@@ -18,7 +18,7 @@ def test_a_change_that_no_fit_sees_has_the_instant_of_unseen_data(fresh_rng):
     factor = float(rng.uniform(0.8, 0.9))
     print("factor", factor, "into the second experiment", into, "s")
     moment = STARTED + LENGTH + PAUSE + into
-    for _ in range(5):  # of experiments that hardly differ, others may be kept unseen
+    for _ in range(5):  # others may be kept unseen, and one in sixteen changes is not found
         machine = next(
             m
             for m in iter(lambda: random_machine(rng, 1), None)
@@ -27,7 +27,7 @@ def test_a_change_that_no_fit_sees_has_the_instant_of_unseen_data(fresh_rng):
         changed = built_in(machine, [(0, StiffnessChange(factor, moment, 0.05, 1))])
         recording = record(changed, int(rng.integers(2**31)))
         found = criticise(recording, machine.model, machine.model).criticism
-        if "multisine 2" in found.held_out.experiments:
+        if "multisine 2" in found.held_out.experiments and found.causes:
             break
     assert found.held_out.experiments == ("multisine 2", "multisine 4")
     first = found.causes[0]
