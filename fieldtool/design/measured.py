@@ -105,35 +105,26 @@ def measured_sensitivity(signals: Excited, servo: Servo) -> Sensitivity:
         The controller that was in the drive; only its filters matter where an offset excited.
     """
     frequency = signals.lines / (signals.samples * signals.step)
+    s = 2j * np.pi * frequency
     torque = _phasors(signals.torque, signals)
     if signals.offset is not None:
         offset = _phasors(signals.offset, signals)
         if signals.lag is not None:
             torque = torque + _folded(offset, frequency, signals.step, signals.lag, servo)
-        size = np.abs(
-            torque / (offset * np.sinc(frequency * signals.step) * _passed(servo, frequency))
-        )
+        held = offset * np.sinc(frequency * signals.step)
+        size = np.abs(torque / (held * servo.loop.filtered(s)))
     else:
         plant = _phasors(signals.position, signals) / torque
-        size = np.abs(1 / (1 + servo.gain(2j * np.pi * frequency) * plant))
+        size = np.abs(1 / (1 + servo.gain(s) * plant))
     order = np.argsort(frequency)
     return Sensitivity(frequency[order], size[order])
-
-
-def _passed(servo: Servo, frequency: FloatArray) -> ComplexArray:
-    """Return what the filters let through at frequencies in Hz."""
-    s = 2j * np.pi * frequency
-    passed = np.ones(s.shape, dtype=np.complex128)
-    for biquad in servo.loop.filters:
-        passed = passed * biquad.response(s)
-    return passed
 
 
 def _folded(
     offset: ComplexArray, frequency: FloatArray, step: float, lag: float, servo: Servo
 ) -> ComplexArray:
     """Return what sampled torques lack, (L,): the offset's first images pass filters of their own."""
-    images = [_passed(servo, frequency + k / step) for k in (-1, 1)]
+    images = [servo.loop.filtered(2j * np.pi * (frequency + k / step)) for k in (-1, 1)]
     held = held_offset(frequency, offset[:, None], step, step - min(lag, step))[:, 0]
     return np.asarray(held * np.mean(images, axis=0), dtype=np.complex128)
 

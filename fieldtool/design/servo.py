@@ -87,10 +87,7 @@ class Servo:
         return np.asarray(late / (1 + s / (2 * np.pi * self.velocity_filter)))
 
     def _torque(self, s: ComplexArray) -> ComplexArray:
-        gain: ComplexArray = np.exp(-self.timing.lag * s)
-        for biquad in self.loop.filters:
-            gain = gain * biquad.response(s)
-        return gain
+        return np.asarray(np.exp(-self.timing.lag * s) * self.loop.filtered(s))
 
     def _held(self, s: ComplexArray) -> ComplexArray:
         x = self.timing.cycle * s

@@ -71,12 +71,16 @@ class AxisLoop:
     """kg m2 or kg."""
     filters: tuple[Biquad, ...] = ()
 
+    def filtered(self, s: NDArray[np.complexfloating[Any, Any]]) -> ComplexArray:
+        """Return the filters' gain at complex frequencies, rad/s, shape of ``s``."""
+        gain = np.ones(s.shape, dtype=np.complex128)
+        for biquad in self.filters:
+            gain = gain * biquad.response(s)
+        return gain
+
     def torque_shape(self, s: complex) -> complex:
         """Return the filters' gain at a complex frequency, rad/s."""
-        gain = 1 + 0j
-        for biquad in self.filters:
-            gain *= complex(biquad.response(np.array([s]))[0])
-        return gain
+        return complex(self.filtered(np.array([s]))[0])
 
     def gain_of_reference(self, s: complex) -> complex:
         """Return torque per reference with the axis locked, at a complex frequency, rad/s."""

@@ -15,6 +15,7 @@ from typing import Any, cast
 import h5py
 import numpy as np
 
+from fieldtool.errors import FileFormatError
 from fieldtool.records.hdf5_file import MemoryFile, Reader, opened, put
 from fieldtool.records.recorded import (
     AxisInfo,
@@ -163,7 +164,10 @@ def load(path: Path | str) -> Recording:
         itself.
     """
     with opened(path, FORMAT) as reader:
-        return _read_recording(reader)
+        try:
+            return _read_recording(reader)
+        except ValueError as error:
+            raise FileFormatError(path, f"does not hold a valid recording: {error}.") from error
 
 
 def _write_header(root: Any, recording: Recording) -> None:

@@ -5,14 +5,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from drives.errors import UserStopError
 from drives.profile import load_machine
 from fieldtool.criticise.criticise import Criticised, criticise
 from fieldtool.criticise.criticism import Criticism
 from fieldtool.criticise.pictured import pictures_of
 from fieldtool.criticise.pictures_file import save_pictures
+from fieldtool.design.machine import DRY, is_machine
 from fieldtool.errors import IdentificationError, NotEnoughDataError
 from fieldtool.identify.recorded import identify_recording
 from fieldtool.records.model import MachineModel
@@ -32,7 +31,7 @@ Place = tuple[str, frozenset[str], str]
 LIGHTER = 0.5
 """Of the motor's inertia: all masses of an axis together can not be less."""
 SAME = (
-    frozenset({"coulomb_friction", "stribeck_friction", "asymmetric_friction"}),
+    frozenset(DRY),
     frozenset({"measurement_delay", "torque_lag"}),
 )
 """Effects of which an axis has one: forms of its dry friction, and of what comes late."""
@@ -235,7 +234,7 @@ def _with_causes(model: MachineModel, extended: MachineModel, new: Set[Place]) -
         effects=(*kept, *extended.effects),
     )
     # Masses and couplings of two fits may not go together.
-    return joined if np.linalg.eigvalsh(joined.mass_matrix)[0] > 0.0 else extended
+    return joined if is_machine(joined) else extended
 
 
 def _instead(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:

@@ -142,7 +142,7 @@ def _unit(setting: Setting, lines: Lines, omega: FloatArray) -> FloatArray:
         here = lines.axis == k
         s = 1j * omega[here]
         if np.all(lines.by_torque[here]):
-            passed = np.abs([own.torque_shape(one) for one in s])
+            passed = np.abs(own.filtered(s))
         else:
             passed = np.abs(loop.response(omega[here], k)[1][:, k])
         unit[here] = limits.torque / np.maximum(passed, FAINT * passed.max())
