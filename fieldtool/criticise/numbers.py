@@ -6,7 +6,6 @@ import numpy as np
 
 from fieldtool.criticise.criticism import Number
 from fieldtool.criticise.effects.base import Effect
-from fieldtool.criticise.search.afterwards import place_of
 from fieldtool.criticise.search.fit import Fitted
 
 WITH_ZERO = ("coulomb_positive", "coulomb_negative")
@@ -17,7 +16,7 @@ UNDETERMINED = 3.0
 
 def numbers_of(fitted: Fitted, effect: Effect) -> Mapping[str, Number]:
     """Return the numbers of a cause with standard errors, by first-order propagation."""
-    place = place_of(fitted.hypothesis, effect)
+    place = fitted.hypothesis.place_of(effect)
     effect = fitted.hypothesis.effects[place]
     values = dict(fitted.hypothesis.values[place])
     lead = f"{place}:{effect.name}."

@@ -40,8 +40,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from fieldtool.criticise.criticise import criticise
 from fieldtool.criticise.effects import candidates
+from fieldtool.criticise.search import instants
 from fieldtool.criticise.search.fit import EXACTLY, fit
-from fieldtool.criticise.search.instants import timed as timed_best
 from fieldtool.criticise.search.screen import screened, tangent
 from fieldtool.criticise.where.sentences import relative_error
 from fieldtool.errors import NotEnoughDataError
@@ -78,8 +78,7 @@ def told(criticised, hidden):
         grown = start.with_effect(one.effect)
         grown = replace(grown, values=(*grown.values[:-1], one.start))
         fitted = fit(simulator, fit(simulator, grown, steps=20).hypothesis, 40, enough=EXACTLY)
-        if hidden.effect == "stiffness_change":
-            fitted = timed_best(simulator, fitted, len(fitted.hypothesis.effects) - 1)
+        fitted = instants.timed(simulator, fitted)
         if best is None or fitted.cost < best.cost:
             best = fitted
     if best is None:

@@ -5,6 +5,8 @@ import pytest
 
 from drives.sim.effects import StiffnessChange
 from fieldtool.criticise.criticise import criticise
+from fieldtool.criticise.search.instants import tried_unseen
+from fieldtool.criticise.search.significance import Comparison
 from tests.hidden.hiding import built_in
 from tests.hidden.plant_recordings import random_machine, record
 
@@ -26,7 +28,8 @@ def test_a_change_that_no_fit_sees_has_the_instant_of_unseen_data(fresh_rng):
         )
         changed = built_in(machine, [(0, StiffnessChange(factor, moment, 0.05, 1))])
         recording = record(changed, int(rng.integers(2**31)))
-        found = criticise(recording, machine.model, machine.model).criticism
+        criticised = criticise(recording, machine.model, machine.model)
+        found = criticised.criticism
         if "multisine 2" in found.held_out.experiments and found.causes:
             break
     assert found.held_out.experiments == ("multisine 2", "multisine 4")
@@ -35,3 +38,14 @@ def test_a_change_that_no_fit_sees_has_the_instant_of_unseen_data(fresh_rng):
     assert first.parameters["change"].value == pytest.approx(factor - 1.0, rel=0.1)
     assert first.parameters["time"].value == pytest.approx(LENGTH + into, abs=0.5)
     assert np.all(np.array([e.torque for e in found.held_out.error_after.values()]) < 0.03)
+    # Twenty instants of the second experiment, and forty around the best: each might do it by chance.
+    search = criticised.found
+    effect = search.accepted[0].tried.effect
+    assert tried_unseen(search.prepared.simulator, search.after.hypothesis, effect) == 62
+
+
+def test_the_best_of_many_is_less_sure():
+    one = Comparison(2.0, 1.0, 5.0, 1e-5, 60)
+    assert one.best_of(62).p == pytest.approx(62e-5)
+    assert one.best_of(10**6).p == 1.0
+    assert one.best_of(1) == one

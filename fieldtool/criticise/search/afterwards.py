@@ -9,6 +9,7 @@ from fieldtool.criticise.effects.base import Effect
 from fieldtool.criticise.effects.friction import friction_candidates
 from fieldtool.criticise.search.fit import EXACTLY, Fitted, fit
 from fieldtool.criticise.search.hypothesis import Hypothesis
+from fieldtool.criticise.search.instants import tried_unseen
 from fieldtool.criticise.search.judge import (
     at_noise,
     difference,
@@ -61,12 +62,6 @@ class Accepted:
     ties: tuple[Tried, ...] = ()
 
 
-def place_of(hypothesis: Hypothesis, effect: Effect) -> int:
-    """Return where an effect stands in a hypothesis."""
-    keys = [e.key for e in hypothesis.effects]
-    return len(keys) - 1 - keys[::-1].index(effect.key)
-
-
 def pruned(
     prepared: Prepared, current: Fitted, accepted: Sequence[Accepted], rejected: Reasons
 ) -> tuple[Fitted, list[Accepted]]:
@@ -80,11 +75,13 @@ def pruned(
             effect = a.tried.effect
             less = fit(
                 simulator,
-                current.hypothesis.without(place_of(current.hypothesis, effect)),
+                current.hypothesis.without(current.hypothesis.place_of(effect)),
                 steps=FEW_STEPS,
             )
             before = simulator.parts(less.hypothesis, "unseen")
-            gain = compared(before, parts)
+            gain = compared(before, parts).best_of(
+                tried_unseen(simulator, current.hypothesis, effect)
+            )
             torque = explained_torque(before, parts, effect.axis)
             why = "" if gain.t >= ALIKE_T else "is not missed once the others are there"
             if torque < LEAST_TORQUE:
@@ -124,7 +121,7 @@ def unsigned(prepared: Prepared, hypothesis: Hypothesis, effect: Effect, share: 
     """
     if not effect.seen_by or share >= NEARLY_ALL:
         return ""
-    place = place_of(hypothesis, effect)
+    place = hypothesis.place_of(effect)
     less = replace(
         hypothesis,
         effects=hypothesis.effects[:place] + hypothesis.effects[place + 1 :],
@@ -160,7 +157,7 @@ def tied(
         for rival in a.ties:
             if rival.effect.key in named or rival in ties:
                 continue
-            swapped = current.hypothesis.without(place_of(current.hypothesis, first.effect))
+            swapped = current.hypothesis.without(current.hypothesis.place_of(first.effect))
             swapped = swapped.with_effect(rival.effect)
             values = rival.fitted.hypothesis.values[rival.place]
             swapped = replace(swapped, values=(*swapped.values[:-1], values))
@@ -234,7 +231,7 @@ def with_directions(
         if abs(off) < OFF_ZERO * current.std[k]:
             out.append(a)
             continue
-        place = place_of(current.hypothesis, effect)
+        place = current.hypothesis.place_of(effect)
         values, machine = current.hypothesis.values[place], current.hypothesis.machine
         names = prepared.recording.names[effect.axis]
         wet = dict(zip(machine.names, current.hypothesis.base, strict=True))
@@ -317,7 +314,7 @@ def convincing(
             )
             rejected[effect.key] = (effect, why)
             kept.remove(a)
-            less = current.hypothesis.without(place_of(current.hypothesis, effect))
+            less = current.hypothesis.without(current.hypothesis.place_of(effect))
             current = fit(prepared.simulator, less)
     return current, kept
 
@@ -361,6 +358,6 @@ def unharmful(
         effect = least.tried.effect
         rejected[effect.key] = (effect, "the error on unseen data would be larger with it")
         kept.remove(least)
-        place = place_of(current.hypothesis, effect)
+        place = current.hypothesis.place_of(effect)
         current = fit(prepared.simulator, current.hypothesis.without(place))
     return current, kept

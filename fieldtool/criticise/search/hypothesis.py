@@ -52,6 +52,11 @@ class Hypothesis:
             structure = effect.structure(structure, values)
         return structure
 
+    def place_of(self, effect: Effect) -> int:
+        """Return where an effect stands among all."""
+        keys = [e.key for e in self.effects]
+        return len(keys) - 1 - keys[::-1].index(effect.key)
+
     def with_effect(self, effect: Effect) -> "Hypothesis":
         """Add one effect at its start values; what it contains goes."""
         alike = [e for e in self.effects if e.name == effect.name and e.key[:4] == effect.key[:4]]

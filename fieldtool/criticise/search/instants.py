@@ -6,12 +6,15 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from fieldtool.criticise.effects.base import Effect
 from fieldtool.criticise.evidence.spans import Role
 from fieldtool.criticise.search.fit import Fitted, fit
 from fieldtool.criticise.search.hypothesis import Hypothesis, Simulator
 from fieldtool.criticise.simulate.motion import Motion
 
 FloatArray = NDArray[np.float64]
+TIMED = "stiffness_change"
+"""The effect that begins at an instant, its number ``time``, s."""
 PARTS = 20
 """Instants of an experiment that are tried, and again around the best of them to either side."""
 MOST = 16
@@ -31,16 +34,14 @@ def instants(simulator: Simulator) -> list[float]:
     return times if len(times) <= MOST else [times[k * len(times) // MOST] for k in range(MOST)]
 
 
-def timed(simulator: Simulator, fitted: Fitted, place: int) -> Fitted:
-    """Return a fit with the instant of one effect at which least is left, where that is another.
+def timed(simulator: Simulator, fitted: Fitted) -> Fitted:
+    """Return a fit with the instant of its last effect at which least is left, where that is another.
 
-    Parameters
-    ----------
-    simulator : Simulator
-    fitted : Fitted
-    place : int
-        Of an effect with a number named ``time``, s.
+    Effects without an instant are left as they are.
     """
+    place = len(fitted.hypothesis.effects) - 1
+    if fitted.hypothesis.effects[place].name != TIMED:
+        return fitted
     return _between(simulator, _within(simulator, fitted, place), place)
 
 
@@ -64,6 +65,15 @@ def _within(simulator: Simulator, fitted: Fitted, place: int) -> Fitted:
     return fitted
 
 
+def tried_unseen(simulator: Simulator, hypothesis: Hypothesis, effect: Effect) -> int:
+    """Return among how many instants unseen data chose that of an effect: 1 if they did not."""
+    if effect.name != TIMED:
+        return 1
+    now = hypothesis.values[hypothesis.place_of(effect)]["time"]
+    between = len(_no_matter(simulator, now))
+    return between * PARTS + 2 * PARTS + 2 if between else 1
+
+
 def _between(simulator: Simulator, fitted: Fitted, place: int) -> Fitted:
     """Return the fit with an instant that lies between what was seen where all data have it.
 
@@ -71,7 +81,16 @@ def _between(simulator: Simulator, fitted: Fitted, place: int) -> Fitted:
     """
     if not np.isfinite(fitted.cost):
         return fitted
-    seen, now = _seen(simulator), fitted.hypothesis.values[place]["time"]
+    between = _no_matter(simulator, fitted.hypothesis.values[place]["time"])
+    if not between:
+        return fitted
+    _, now = _best(simulator, fitted, place, between, ("fit", "unseen"))
+    return replace(fitted, hypothesis=_moved(fitted.hypothesis, place, now))
+
+
+def _no_matter(simulator: Simulator, now: float) -> list[Motion]:
+    """Return the motions within which an instant is no matter to the fit, and may lie as well as now."""
+    seen = _seen(simulator)
     compared = [
         (m.clock[lines.span.start], m.clock[lines.span.stop - 1])
         for lines in simulator.lines
@@ -83,12 +102,8 @@ def _between(simulator: Simulator, fitted: Fitted, place: int) -> Fitted:
     first = max((stop for _, stop in compared if stop - edge <= now), default=-np.inf)
     last = min((start for start, _ in compared if start + edge >= now), default=np.inf)
     if any(first < start and stop < last for start, stop in compared):
-        return fitted
-    between = [m for m in simulator.motions.values() if first < m.clock[0] and m.clock[-1] < last]
-    if not between:
-        return fitted
-    _, now = _best(simulator, fitted, place, between, ("fit", "unseen"))
-    return replace(fitted, hypothesis=_moved(fitted.hypothesis, place, now))
+        return []
+    return [m for m in simulator.motions.values() if first < m.clock[0] and m.clock[-1] < last]
 
 
 def _seen(simulator: Simulator) -> list[Motion]:

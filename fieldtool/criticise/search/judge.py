@@ -9,6 +9,7 @@ from fieldtool.criticise.effects.base import Effect
 from fieldtool.criticise.evidence.lines import Lines
 from fieldtool.criticise.search.fit import Fitted
 from fieldtool.criticise.search.hypothesis import Simulator
+from fieldtool.criticise.search.instants import tried_unseen
 from fieldtool.criticise.search.rules import BESIDE_NOISE, LEFT, Tried
 from fieldtool.criticise.search.significance import Comparison, compared
 from fieldtool.criticise.where.sentences import relative_noise
@@ -26,7 +27,7 @@ def judged(simulator: Simulator, fitted: Fitted, effect: Effect, before: Parts) 
     return Tried(
         fitted,
         effect,
-        compared(before, after),
+        compared(before, after).best_of(tried_unseen(simulator, fitted.hypothesis, effect)),
         explained_share(before, after, axes),
         explained_torque(before, after, effect.axis),
         beyond_noise(before, axes),

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from fieldtool.criticise.effects.base import Effect, Mark
-from fieldtool.criticise.search.afterwards import Accepted, Reasons, place_of
+from fieldtool.criticise.search.afterwards import Accepted, Reasons
 from fieldtool.criticise.search.fit import EXACTLY, Fitted, fit
 from fieldtool.criticise.search.hypothesis import Simulator
 from fieldtool.criticise.search.judge import at_noise
@@ -83,7 +83,7 @@ def readings(
         Names of those whose marks are asked for.
     """
     hypothesis = current.hypothesis
-    place = place_of(hypothesis, effect)
+    place = hypothesis.place_of(effect)
     marks = hypothesis.effects[place].marks(hypothesis.values[place], prepared.context(hypothesis))
     marks = tuple(m for m in marks if m.relative in relatives)
     if not marks:
@@ -142,7 +142,7 @@ def _one(
         rival = next((t for t in a.ties if _is(t, mark.relative, effect.axis)), None)
         if reading.shown != "its own" and mark.relative in without:
             rejected[effect.key] = (effect, lacking(mark))
-            less = current.hypothesis.without(place_of(current.hypothesis, effect))
+            less = current.hypothesis.without(current.hypothesis.place_of(effect))
             return Unmarked(effect, mark, current), fit(prepared.simulator, less)
         if rival is None or (mark.special and reading.shown != "its relative's"):
             continue
@@ -162,9 +162,9 @@ def _one(
 
 def _swapped(prepared: Prepared, current: Fitted, effect: Effect, rival: Tried) -> Fitted:
     """Put a rival in a cause's place, all else fitted beside."""
-    hypothesis = current.hypothesis.without(place_of(current.hypothesis, effect))
+    hypothesis = current.hypothesis.without(current.hypothesis.place_of(effect))
     hypothesis = hypothesis.with_effect(rival.effect)
-    values = rival.fitted.hypothesis.values[place_of(rival.fitted.hypothesis, rival.effect)]
+    values = rival.fitted.hypothesis.values[rival.fitted.hypothesis.place_of(rival.effect)]
     return fit(prepared.simulator, replace(hypothesis, values=(*hypothesis.values[:-1], values)))
 
 

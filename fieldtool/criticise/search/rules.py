@@ -124,8 +124,7 @@ class Tried:
     @property
     def place(self) -> int:
         """Index of the effect in the hypothesis."""
-        keys = [e.key for e in self.fitted.hypothesis.effects]
-        return len(keys) - 1 - keys[::-1].index(self.effect.key)
+        return self.fitted.hypothesis.place_of(self.effect)
 
 
 def why_not(tried: Tried, context: Context, known_noise: bool, level: float, further: bool) -> str:

@@ -14,7 +14,6 @@ from fieldtool.criticise.search.afterwards import (
     Accepted,
     Reasons,
     convincing,
-    place_of,
     pruned,
     tied,
     unharmful,
@@ -231,9 +230,7 @@ def _round(
             if one.gain < FAR_BEHIND * clear and one.effect.name != "measurement_delay":
                 continue
             step((number + SCREENING + (1 - SCREENING) * k / len(chosen)) / len(starts))
-            fitted = fit(simulator, _grown(start, one), shared=at.of_machine)
-            if one.effect.name == "stiffness_change":
-                fitted = timed(simulator, fitted, len(fitted.hypothesis.effects) - 1)
+            fitted = timed(simulator, fit(simulator, _grown(start, one), shared=at.of_machine))
             key = one.effect.key
             if not np.isfinite(fitted.cost):
                 rejected[key] = (one.effect, "the simulated machine runs away with it")
@@ -404,7 +401,7 @@ def _pair(
         missed = [
             difference(
                 simulator,
-                fit(simulator, fitted.hypothesis.without(place_of(fitted.hypothesis, t.effect))),
+                fit(simulator, fitted.hypothesis.without(fitted.hypothesis.place_of(t.effect))),
                 fitted,
             ).t
             for t in both

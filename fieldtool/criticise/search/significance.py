@@ -16,7 +16,7 @@ both are tested as well, and the smaller of both probabilities counts twice.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,6 +53,13 @@ class Comparison:
     p: float
     """Probability of such a gain by chance."""
     blocks: int
+
+    def best_of(self, tried: int) -> "Comparison":
+        """Return this of the best of some hypotheses that the same rows chose among.
+
+        Each might have had such a gain by chance (Bonferroni).
+        """
+        return replace(self, p=min(1.0, tried * self.p))
 
 
 def compared(before: Parts, after: Parts) -> Comparison:
