@@ -21,7 +21,7 @@ from drives.canopen_drive.strangers import Strangers, commands
 from drives.canopen_drive.sync import HostSync, KernelSync
 from drives.canopen_drive.torque_offset import why_not
 from drives.cia402 import Mode
-from drives.errors import BusError, LimitsError, NothingMovedError, NotSupportedError
+from drives.errors import BusError, LimitsError, NothingMovedError, NotSupportedError, SdoError
 from drives.objects import ObjectInfo
 from drives.profile import AxisProfile, DriveProfile, MachineProfile, load_drive
 from drives.trace import traced
@@ -371,7 +371,7 @@ def connect(
         stack.callback(_forget_nodes, line)
         drives = [CanopenDrive(line, axis, profiles[axis.name]) for axis in machine.axes]
         for drive in drives:
-            drive.identify()
+            _identify(drive)
         _check_alone(line, drives)
         recovered = []
         for drive in drives if to_move else ():
@@ -420,9 +420,23 @@ def _check_alone(line: Line, drives: Sequence[CanopenDrive]) -> None:
             "one machine. Stop the other controller first."
         )
     for drive in drives:
-        if drive.unasked_answers:
-            raise NothingMovedError(
-                f"{drive.axis}: node {drive.node_id} answers more often than it is asked: two drives "
-                "have this node id, or another program talks to it. Give every drive an id of its own, "
-                "and close other programs."
-            )
+        _check_only_one(drive)
+
+
+def _identify(drive: CanopenDrive) -> None:
+    """Ask a drive what it is; an error that a second one with its node id makes is said as such."""
+    try:
+        drive.identify()
+    except SdoError:
+        _check_only_one(drive)
+        raise
+
+
+def _check_only_one(drive: CanopenDrive) -> None:
+    """Refuse a node that answers more often than it is asked."""
+    if drive.unasked_answers or drive.node.sdo.contradicted:
+        raise NothingMovedError(
+            f"{drive.axis}: node {drive.node_id} answers more often than it is asked: two drives "
+            "have this node id, or another program talks to it. Give every drive an id of its own, "
+            "and close other programs."
+        )

@@ -17,6 +17,8 @@ LONGEST = 1_000_000
 """Most bytes of one object that are read: no drive has more, and a defective one never ends."""
 MOST_STRANGE = 1000
 """Most answers that are passed over while one is waited for."""
+MOST_OWED = 100
+"""Most answers that are remembered to be missing: a node that is off owes ever more."""
 
 _DOWNLOAD_SEGMENT, _DOWNLOAD, _UPLOAD, _UPLOAD_SEGMENT, _ABORT = 0, 1, 2, 3, 4
 _ANSWER_TO = {_DOWNLOAD_SEGMENT: 1, _DOWNLOAD: 3, _UPLOAD: 2, _UPLOAD_SEGMENT: 0}
@@ -31,13 +33,16 @@ class StrictSdoClient(SdoClient):  # type: ignore[misc]
     _place = bytes(3)
     """Index and sub-index of the transfer, as they are sent."""
     _segments = 0
-    _owed = 0
-    """Answers that did not come in time, and may still come."""
+    _owed: tuple[bytes, ...] = ()
+    """Of which objects answers did not come in time, and may still come."""
     unasked = 0
     """Answers to nothing: more than were asked for."""
     contradicted = ""
     """About which object two answers came that differ; then nothing that the node says is known."""
+    told_all_the_same = False
+    """Whether a node that is contradicted is written to: what it said before is put back."""
     _last = b""
+    """What was read last, as it came."""
 
     def request_response(self, sdo_request: bytes) -> bytes:
         """Send a request, and return the answer that fits it.
@@ -50,12 +55,13 @@ class StrictSdoClient(SdoClient):  # type: ignore[misc]
             If no answer fits in time, or a transfer does not end.
         """
         self.forget_old()
-        if self.contradicted:
+        specifier = sdo_request[0] >> 5
+        told = self.told_all_the_same and specifier in (_DOWNLOAD, _DOWNLOAD_SEGMENT)
+        if self.contradicted and not told:
             raise SdoCommunicationError(
                 f"two answers came about {self.contradicted} that differ: two drives have this node id, "
                 "or somebody else answers for it"
             )
-        specifier = sdo_request[0] >> 5
         if specifier in (_DOWNLOAD, _UPLOAD):
             self._place, self._segments = bytes(sdo_request[1:4]), 0
         else:
@@ -69,13 +75,19 @@ class StrictSdoClient(SdoClient):  # type: ignore[misc]
     def forget_old(self) -> None:
         """Take note of answers that nobody waited for, and drop them."""
         while not self.responses.empty():
-            answer = bytes(self.responses.get_nowait())
-            if self._owed:
-                self._owed -= 1
-                continue
-            self.unasked += 1
-            if answer[:4] == self._last[:4] and answer != self._last:
-                self.contradicted = _place(answer)
+            self.unasked += not self._was_owed(bytes(self.responses.get_nowait()))
+
+    def _was_owed(self, answer: bytes) -> bool:
+        """Whether an answer that is passed over came late; else see whether it contradicts the last."""
+        place = answer[1:4]
+        if place in self._owed:
+            at = self._owed.index(place)
+            self._owed = self._owed[:at] + self._owed[at + 1 :]
+            return True
+        read = len(answer) == SDO_BYTES and answer[0] >> 5 == _ANSWER_TO[_UPLOAD]
+        if read and place == self._last[1:4] and answer != self._last:
+            self.contradicted = _place(answer)
+        return False
 
     def _answer(self, request: bytes) -> bytes:
         strange: list[bytes] = []
@@ -89,12 +101,14 @@ class StrictSdoClient(SdoClient):  # type: ignore[misc]
             if self._fits(request, answer):
                 if answer[0] >> 5 == _ABORT:
                     raise SdoAbortedError(struct.unpack_from("<L", answer, 4)[0])
-                self._last = answer
+                if request[0] >> 5 == _UPLOAD:
+                    self._last = answer
                 return answer
+            self._was_owed(answer)
             strange.append(answer)
         self.abort(0x05040000)
         if not strange:
-            self._owed += 1
+            self._owed = (*self._owed, self._place)[-MOST_OWED:]
             raise SdoCommunicationError("No SDO response received")
         raise SdoCommunicationError(f"{_in_words(strange[0], request)}; no right one came")
 

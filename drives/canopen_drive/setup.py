@@ -83,8 +83,16 @@ class TemporaryObjects:
     def put_back(self) -> list[str]:
         """Write all old values, newest first; return what failed, in words.
 
-        A drive that does not answer any more, or not rightly, is not asked for each of them.
+        A drive that does not answer any more, or not rightly, is not asked for each of them.  One for
+        which somebody else answers as well is written to all the same: the values are of before.
         """
+        with self._drive.told_all_the_same():
+            failures = self._written()
+        if failures:
+            self._drive.left_changed = True
+        return failures
+
+    def _written(self) -> list[str]:
         failures = []
         while self._before:
             info, before, matters = self._before.pop()
@@ -102,8 +110,6 @@ class TemporaryObjects:
                         f"more; not put back: {', '.join(left)}. Switch the drive off and on."
                     )
                     self._before.clear()
-        if failures:
-            self._drive.left_changed = True
         return failures
 
     def _write_surely(self, info: ObjectInfo, value: float) -> None:

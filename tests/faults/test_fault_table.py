@@ -29,6 +29,7 @@ WENT_WRONG_ONCE = {
     ("torque scale times ten", Moment.CONNECTING),
     ("torque scale by ten", Moment.SWEEP),
     ("node id twice", Moment.CONNECTING),
+    ("node id twice", Moment.SWEEP),
 }
 """What the tool did wrong when it was tried first."""
 SEED = int(os.environ.get("FAULT_SEED", fresh_seed()))

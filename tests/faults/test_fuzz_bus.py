@@ -37,11 +37,13 @@ def test_frames_that_look_like_the_nodes_own(kind, moment):
         (Noise("answers", 0.3, 2343595180, quiet=100), Moment.WRITE),
         (Noise("answers", 0.05, 589927323, quiet=300), Moment.SWEEP),
         (Noise("answers", 0.3, 1184570331, quiet=100), Moment.SWEEP),
+        (Noise("answers", 0.3, 1630593117, quiet=100), Moment.WRITE),
     ],
     ids=[
         "called a node without a pause",
         "did not say what was not put back",
         "put back what a wrong answer had said",
+        "took back what a wrong answer had said",
     ],
 )
 def test_what_went_wrong_once(noise, moment):
