@@ -1,7 +1,7 @@
 """All drives of a machine: connected, checked, and put back as they were."""
 
 import sys
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import cached_property
 from pathlib import Path
@@ -51,6 +51,8 @@ class CanopenGroup:
         """What could not be put back, in words."""
         self.onlooker: Onlooker | None = None
         """Sees every block of all motions; none where it is None."""
+        self._unsure: dict[str, str] = {}
+        """Axes that may still be enabled, and why, in words."""
         self.punctuality = Punctuality()
         """How well the host has kept the cycles of all motions so far."""
 
@@ -180,11 +182,8 @@ class CanopenGroup:
                 setup.clear_torque_offset(drive, changes, streamed=streamed)
                 setup.process_data(drive, changes, torque_offset=streamed)
             stack.callback(self.line.end_heartbeat)
-            unsure: dict[str, str] = {}
             for drive in self._drives:  # last, and so first to be put back
-                changes = setup.TemporaryObjects(drive)
-                stack.callback(self._disarm, changes, drive, unsure)
-                fail_safe.arm(drive, changes, bus.host_lost_after)
+                fail_safe.arm(drive, self._changes(stack, drive), bus.host_lost_after)
             for drive in self._drives:
                 stack.callback(self._leave_operational, drive)
             for drive in self._drives:
@@ -206,7 +205,7 @@ class CanopenGroup:
                 self.machine.couplings,
                 bus.host_lost_after,
             )
-            motion.perhaps_enabled = unsure
+            motion.perhaps_enabled = self._unsure
             motion.onlooker = self.onlooker
             if self.onlooker is not None:
                 self.onlooker.begin(cycle_time)
@@ -272,11 +271,23 @@ class CanopenGroup:
 
     def _changes(self, stack: ExitStack, drive: CanopenDrive) -> setup.TemporaryObjects:
         changes = setup.TemporaryObjects(drive)
-        stack.callback(self._put_back, changes)
+        stack.callback(self._put_back, changes, drive)
         return changes
 
-    def _put_back(self, changes: setup.TemporaryObjects) -> None:
-        """Put a drive's objects back; what fails joins the warnings and the error on its way."""
+    def _put_back(self, changes: setup.TemporaryObjects, drive: CanopenDrive) -> None:
+        """Put a drive's objects back; what fails joins the warnings and the error on its way.
+
+        Nothing is written to a drive that may be enabled: an old mode has its own old targets, and
+        the fail-safe objects may be all that stops it.
+        """
+        if drive.axis in self._unsure:
+            drive.left_changed = True
+            self._warn(
+                f"{drive.axis}: its fail-safe objects (0x1016, 0x6007, 0x1029) were left armed, and its "
+                "mode and PDOs as they were for the motion, because the drive may still be enabled. "
+                "Switch the drive off and on."
+            )
+            return
         with uninterrupted():
             failures = changes.put_back()
         error = sys.exc_info()[1]
@@ -284,19 +295,6 @@ class CanopenGroup:
             self._warn(f"could not be put back: {text}")
             if error is not None:
                 error.add_note(f"could not be put back: {text}")
-
-    def _disarm(
-        self, changes: setup.TemporaryObjects, drive: CanopenDrive, unsure: Mapping[str, str]
-    ) -> None:
-        """Put the fail-safe objects back, but not while they may be all that stops a drive."""
-        if drive.axis in unsure:
-            drive.left_changed = True
-            self._warn(
-                f"{drive.axis}: its fail-safe objects (0x1016, 0x6007, 0x1029) were left armed, because "
-                "the drive may still be enabled. Switch the drive off and on."
-            )
-        else:
-            self._put_back(changes)
 
     def _note_punctuality(self, motion: CanopenMotion) -> None:
         self.punctuality = self.punctuality.plus(motion.punctuality)

@@ -67,6 +67,11 @@ def test_a_drive_that_can_not_be_switched_off_keeps_its_fail_safe(bench):
     assert "emergency stop" in notes
     assert any("left armed" in text for text in group.warnings)
     assert node(bench, TABLE).dictionary.read(0x1016, 1) != 0
+    assert (
+        node(bench, TABLE).dictionary.read(0x6060, 0) == 8
+    )  # its old mode has its own old targets
+    assert group.drives[0].left_changed
+    assert node(bench, ARM).dictionary.read(0x6060, 0) != 8
     with bench.connected() as again:  # time passes, and no heartbeat comes
         again.line.wait(1.0)
     assert bench.powered() == {}
