@@ -19,6 +19,9 @@ MOST_STRANGE = 1000
 """Most answers that are passed over while one is waited for."""
 MOST_OWED = 100
 """Most answers that are remembered to be missing: a node that is off owes ever more."""
+CHANGING = {0x1001, 0x1003, 0x603F, 0x6041, 0x606C, 0x60F4, 0x60FD}
+CHANGING |= {*range(0x6061, 0x6065), *range(0x6077, 0x607A)}
+"""Objects that change by themselves: two answers about one may differ."""
 
 _DOWNLOAD_SEGMENT, _DOWNLOAD, _UPLOAD, _UPLOAD_SEGMENT, _ABORT = 0, 1, 2, 3, 4
 _ANSWER_TO = {_DOWNLOAD_SEGMENT: 1, _DOWNLOAD: 3, _UPLOAD: 2, _UPLOAD_SEGMENT: 0}
@@ -34,7 +37,7 @@ class StrictSdoClient(SdoClient):  # type: ignore[misc]
     """Index and sub-index of the transfer, as they are sent."""
     _segments = 0
     _owed: tuple[bytes, ...] = ()
-    """Of which objects answers did not come in time, and may still come."""
+    """Of which objects answers did not come in time or were not waited for, and may still come."""
     unasked = 0
     """Answers to nothing: more than were asked for."""
     contradicted = ""
@@ -42,7 +45,7 @@ class StrictSdoClient(SdoClient):  # type: ignore[misc]
     told_all_the_same = False
     """Whether a node that is contradicted is written to: what it said before is put back."""
     _last = b""
-    """What was read last, as it came."""
+    """What was read last, as it came; nothing once it was written."""
 
     def request_response(self, sdo_request: bytes) -> bytes:
         """Send a request, and return the answer that fits it.
@@ -69,6 +72,7 @@ class StrictSdoClient(SdoClient):  # type: ignore[misc]
         if self._segments * 7 > LONGEST:
             self.abort(0x05040005)
             raise SdoCommunicationError(f"it has more than {LONGEST} bytes, and does not end")
+        self._owed = (*self._owed, self._place)[-MOST_OWED:]
         self.send_request(sdo_request)
         return self._answer(bytes(sdo_request))
 
@@ -81,13 +85,19 @@ class StrictSdoClient(SdoClient):  # type: ignore[misc]
         """Whether an answer that is passed over came late; else see whether it contradicts the last."""
         place = answer[1:4]
         if place in self._owed:
-            at = self._owed.index(place)
-            self._owed = self._owed[:at] + self._owed[at + 1 :]
+            self._settle(place)
             return True
+        if int.from_bytes(place[:2], "little") in CHANGING:
+            return False
         read = len(answer) == SDO_BYTES and answer[0] >> 5 == _ANSWER_TO[_UPLOAD]
         if read and place == self._last[1:4] and answer != self._last:
             self.contradicted = _place(answer)
         return False
+
+    def _settle(self, place: bytes) -> None:
+        """No longer wait for one answer about an object."""
+        at = self._owed.index(place)
+        self._owed = self._owed[:at] + self._owed[at + 1 :]
 
     def _answer(self, request: bytes) -> bytes:
         strange: list[bytes] = []
@@ -99,16 +109,19 @@ class StrictSdoClient(SdoClient):  # type: ignore[misc]
                 break
             answer = bytes(self.responses.get_nowait())
             if self._fits(request, answer):
+                if self._place in self._owed:
+                    self._settle(self._place)
                 if answer[0] >> 5 == _ABORT:
                     raise SdoAbortedError(struct.unpack_from("<L", answer, 4)[0])
                 if request[0] >> 5 == _UPLOAD:
                     self._last = answer
+                elif self._place == self._last[1:4]:
+                    self._last = b""
                 return answer
             self._was_owed(answer)
             strange.append(answer)
         self.abort(0x05040000)
         if not strange:
-            self._owed = (*self._owed, self._place)[-MOST_OWED:]
             raise SdoCommunicationError("No SDO response received")
         raise SdoCommunicationError(f"{_in_words(strange[0], request)}; no right one came")
 

@@ -48,22 +48,19 @@ class TemporaryObjects:
         self._drive = drive
         self._before: list[tuple[ObjectInfo, float, bool]] = []
 
-    def change(self, info: ObjectInfo, value: float, before: float | None = None) -> None:
-        """Write a value, remembering the one before (read now, unless given).
+    def change(self, info: ObjectInfo, value: float) -> None:
+        """Write a value, remembering the one before.
 
-        What is to be written back later is read twice: a wrong answer must not become a parameter.
+        Raises
+        ------
+        NotSupportedError
+            If the object changes by itself, or the drive holds another value than it was given.
+        SdoError
+            If it can not be read or written.
         """
-        if before is None:
-            before = self._drive.read_number(info)
+        before = self.before(info)
         if before == value:
             return
-        again = self._drive.read_number(info)
-        if again != before:
-            raise NotSupportedError(
-                f"{self._drive.axis}, object {info.address} ({info.name}): read as {before}, then as "
-                f"{again}. It changes by itself, or answers come wrong: it was not changed. Check the "
-                "bus, and that nobody else writes to the drive."
-            )
         self.note(info, before)
         self._drive.write(info, value)
         found = self._drive.read_number(info)
@@ -73,6 +70,26 @@ class TemporaryObjects:
                 f"holds {found}. It can not be used safely."
             )
 
+    def before(self, info: ObjectInfo) -> float:
+        """Read what is to be written back later; twice, for a wrong answer must not become a parameter.
+
+        Raises
+        ------
+        NotSupportedError
+            If it changes by itself.
+        SdoError
+            If it can not be read.
+        """
+        before = self._drive.read_number(info)
+        again = self._drive.read_number(info)
+        if again != before:
+            raise NotSupportedError(
+                f"{self._drive.axis}, object {info.address} ({info.name}): read as {before}, then as "
+                f"{again}. It changes by itself, or answers come wrong: it was not changed. Check the "
+                "bus, and that nobody else writes to the drive."
+            )
+        return before
+
     def note(self, info: ObjectInfo, before: float, matters: bool = True) -> None:
         """Remember a value to be written when all is put back.
 
@@ -81,13 +98,20 @@ class TemporaryObjects:
         self._before.append((info, before, matters))
 
     def put_back(self) -> list[str]:
-        """Write all old values, newest first; return what failed, in words.
+        """Write all old values, newest first, and read them back; return what failed, in words.
 
         A drive that does not answer any more, or not rightly, is not asked for each of them.  One for
         which somebody else answers as well is written to all the same: the values are of before.
         """
+        wanted = {
+            info.address: (info, before)
+            for info, before, matters in reversed(self._before)
+            if matters
+        }
         with self._drive.told_all_the_same():
             failures = self._written()
+            if not failures:
+                failures = [text for pair in wanted.values() if (text := self._held(*pair))]
         if failures:
             self._drive.left_changed = True
         return failures
@@ -122,6 +146,22 @@ class TemporaryObjects:
             if self._drive.read_number(info) != value:
                 self._drive.write(info, value)
 
+    def _held(self, info: ObjectInfo, value: float) -> str:
+        """Return a sentence if a drive does not hold what was put back, though it was told once more."""
+        try:
+            if self._drive.read_number(info) == value:
+                return ""
+            self._drive.write(info, value)
+            found = self._drive.read_number(info)
+        except DrivesError as error:
+            return str(error)
+        if found == value:
+            return ""
+        return (
+            f"{self._drive.axis}, object {info.address} ({info.name}): wrote {value} as it was before, "
+            f"the drive holds {found}."
+        )
+
 
 def mode(drive: CanopenDrive, wanted: Mode, changes: TemporaryObjects) -> None:
     """Set the mode of operation, remembering the one before.
@@ -131,7 +171,7 @@ def mode(drive: CanopenDrive, wanted: Mode, changes: TemporaryObjects) -> None:
     NotSupportedError
         If the drive does not confirm.
     """
-    before = drive.read_int(objects.MODE)
+    before = changes.before(objects.MODE)
     changes.note(objects.MODE, before, matters=before != NO_MODE)
     drive.set_mode(wanted)
 
@@ -156,7 +196,7 @@ def cycle(drive: CanopenDrive, cycle_time: float, changes: TemporaryObjects) -> 
     changes.change(objects.INTERPOLATION_VALUE, round(value))
     period = drive.read_optional(objects.SYNC_PERIOD)
     if period:
-        changes.change(objects.SYNC_PERIOD, round(cycle_time * 1e6), period)
+        changes.change(objects.SYNC_PERIOD, round(cycle_time * 1e6))
 
 
 def _check_sync(drive: CanopenDrive, cycle_time: float) -> None:
@@ -200,7 +240,7 @@ def clear_torque_offset(drive: CanopenDrive, changes: TemporaryObjects, *, strea
         return
     if streamed and before == 0:
         changes.note(info, 0)
-    changes.change(info, 0, before)
+    changes.change(info, 0)
 
 
 def process_data(
@@ -242,7 +282,7 @@ def _switch_off(drive: CanopenDrive, communication: int, changes: TemporaryObjec
     info = cob_id_of(communication)
     before = drive.read_optional(info)
     if before is not None and not before & PDO_OFF:
-        changes.change(info, before | PDO_OFF, before)
+        changes.change(info, before | PDO_OFF)
 
 
 def _map(
@@ -254,8 +294,8 @@ def _map(
     changes: TemporaryObjects,
 ) -> None:
     identifier, kind, count = cob_id_of(communication), kind_of(communication), count_of(mapping)
-    old_identifier, old_count = drive.read_int(identifier), drive.read_int(count)
-    old_entries = [drive.read_int(entry_of(mapping, k + 1)) for k in range(old_count)]
+    old_identifier, old_count = (int(changes.before(info)) for info in (identifier, count))
+    old_entries = [changes.before(entry_of(mapping, k + 1)) for k in range(old_count)]
     # Put back in reverse: off, identifier, type, count 0, entries, count, on.  CiA 301, clause 7.5.2.36.
     off = (old_identifier | PDO_OFF) & 0xFFFFFFFF
     changes.note(identifier, old_identifier)
