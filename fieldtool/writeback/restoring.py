@@ -34,7 +34,7 @@ from drives.parameters.access import needs_password
 from drives.parameters.journal import Goal
 from fieldtool.writeback.earlier import FIRST_BACKUP, memory_seen_from
 from fieldtool.writeback.transaction import tell_storing
-from fieldtool.writeback.unfinished import JOURNAL, JournalKeeper, not_kept
+from fieldtool.writeback.unfinished import JOURNAL, JournalKeeper, not_kept, refuse_elsewhere
 
 
 @dataclass(frozen=True)
@@ -173,20 +173,23 @@ def bring_back(
 
     Raises
     ------
-    ProfileError, WrongDeviceError, DriveFaultError, NotSupportedError, OutputError
-        Before anything is written.
+    ProfileError, WrongDeviceError, DriveFaultError, NotSupportedError, OutputError, UnfinishedWriteError
+        Before anything is written; the last if what was cut off in these drives is in another folder.
     WriteBackMixedError
         If a value could not be restored or stored; every other one was.
     """
     before = source.journal
+    cut_off = before if before is not None and before.is_open else None
     parts = tuple(part for part in source.backup.drives if part.axis not in without)
     if not parts:
         raise ProfileError(source.backup_path, "holds no other axis. Nothing was written.")
     journal = journal_back(machine, source, store)
     check_same_drives(drives, parts, "backup", trusted=same_drives)
-    if before is not None and before.is_open:
-        there = tuple(record for record in before.drives if record.axis not in without)
+    if cut_off is not None:
+        there = tuple(record for record in cut_off.drives if record.axis not in without)
         check_same_drives(drives, there, "write journal", trusted=same_drives)
+    if not all(drive.begins_anew for drive in drives):
+        refuse_elsewhere(machine, source.backup.drives, source.backup_path.parent, cut_off)
     by_axis = {drive.axis: drive for drive in drives}
     notes = []
     for part in parts:
@@ -237,7 +240,7 @@ def bring_back(
         )
     return Restored(
         source.backup_path,
-        before if before is not None and before.is_open else None,
+        cut_off,
         tuple(transaction.outcomes.values()),
         had_write=journal.writes,
         left_out=tuple(p.axis for p in source.backup.drives if p.axis in without),
@@ -253,7 +256,11 @@ def _without_set_up(backup: Backup) -> Backup:
 def journal_back(machine: str, source: Source, store: bool) -> Journal:
     """Return the journal of bringing a backup back; it goes on where one before was cut off."""
     before = source.journal
-    missing = {r.axis for r in before.drives} if before is not None and before.is_open else set()
+    begun = datetime.now(UTC).isoformat(timespec="seconds")
+    missing = set[str]()
+    if before is not None and before.is_open:
+        begun = before.begun  # by which a folder that was moved is known again
+        missing = {record.axis for record in before.drives}
     missing -= {part.axis for part in source.backup.drives}
     if missing:
         raise ProfileError(
@@ -269,7 +276,7 @@ def journal_back(machine: str, source: Source, store: bool) -> Journal:
         storing = before.storing if before.goal is Goal.OLD else Storing.NEEDED
     return Journal(
         machine,
-        datetime.now(UTC).isoformat(timespec="seconds"),
+        begun,
         source.backup_path.name,
         storing,
         tuple(_record_back(part, source) for part in source.backup.drives),

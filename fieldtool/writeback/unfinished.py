@@ -9,16 +9,17 @@ computer or user has left there.
 import os
 import re
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import yaml
 from filelock import FileLock, Timeout
 
 from drives.errors import ProfileError
-from drives.parameters import Journal, Phase, load_journal, save_journal
+from drives.parameters import DriveRecord, Journal, Phase, load_journal, save_journal
 from drives.parameters.durable import remove_durably, write_durably
 from drives.parameters.guard import Recorded
 from drives.parameters.values import ParameterDrive
@@ -78,15 +79,13 @@ class JournalKeeper:
             self._note(journal)
             self._noted = True
         elif not journal.is_open:
-            for record in journal.drives:
-                remove_durably(_note_of(journal.machine, record))
+            self._remove_notes(journal.machine, journal.drives)
 
     def settle(self, journal: Journal) -> None:
         """Remove the notes of drives that are in order, where others of the journal are not."""
         with suppress(OSError):
-            for record in journal.drives:
-                if record.phase is Phase.ROLLED_BACK:
-                    remove_durably(_note_of(journal.machine, record))
+            back = [r for r in journal.drives if r.phase is Phase.ROLLED_BACK]
+            self._remove_notes(journal.machine, back)
 
     def ended_before(self) -> bytes | None:
         """Return the journal that is there, word by word; None if it is open, or there is none."""
@@ -104,8 +103,7 @@ class JournalKeeper:
                 remove_durably(self.path)
             else:
                 write_durably(self.path, before)
-            for record in journal.drives:
-                remove_durably(_note_of(journal.machine, record))
+            self._remove_notes(journal.machine, journal.drives)
 
     def _note(self, journal: Journal) -> None:
         state_folder().mkdir(parents=True, exist_ok=True)
@@ -118,6 +116,14 @@ class JournalKeeper:
                 "begun": journal.begun,
             }
             write_durably(_note_of(journal.machine, record), yaml.safe_dump(data).encode())
+
+    def _remove_notes(self, machine: str, records: Iterable[DriveRecord]) -> None:
+        """Remove the notes of drives; one about another folder stays."""
+        for record in records:
+            note = _note_of(machine, record)
+            with suppress(ProfileError):  # there is none, or it does not say whose it is
+                if Path(_noted(note)["session"]) == self.path.parent.resolve():
+                    remove_durably(note)
 
 
 def not_kept(keeper: JournalKeeper, error: OSError) -> OutputError:
@@ -174,12 +180,7 @@ def refuse_unfinished(machine: str, drives: Sequence[ParameterDrive], session: P
     for one in recorded:
         note = _note_of(machine, one)
         if note.exists():
-            folder = _folder_of(note)
-            journal = _journal(folder / JOURNAL, note)
-            if not journal.is_open:
-                remove_durably(note)
-            elif _concerns(journal, one, same_place=True):
-                raise _refusal(folder, one.axis, journal)
+            _refuse_noted(note, one)
     for journal_file in (session / JOURNAL, *_neighbours(session)):
         if journal_file.is_file() and _may_be_open(journal_file):
             own = journal_file.parent == session
@@ -187,6 +188,64 @@ def refuse_unfinished(machine: str, drives: Sequence[ParameterDrive], session: P
             axis = None if found is None else _same_drive(found, recorded, own=own)
             if found is not None and axis is not None:
                 raise _refusal(journal_file.parent, axis, found)
+
+
+def refuse_elsewhere(
+    machine: str, recorded: Iterable[Recorded], folder: Path, cut_off: Journal | None
+) -> None:
+    """Refuse to restore a folder where what was cut off in its drives is in another one.
+
+    That other journal knows what the drives have stored; a restore that does not would end with drives
+    that hold old and new values mixed after a power cycle, and its notes would be gone.
+
+    Parameters
+    ----------
+    machine
+        Its name.
+    recorded
+        All drives of the backup, those that are left out too.
+    folder
+        That is to be restored.
+    cut_off
+        Its journal, if it is open.
+
+    Raises
+    ------
+    UnfinishedWriteError
+        With the command that takes it back, and what to do where that is not possible any more.
+    """
+    for one in recorded:
+        note = _note_of(machine, one)
+        if note.exists() and not _is_about(note, one, folder, cut_off):
+            _refuse_noted(
+                note,
+                one,
+                f" If that can not be done any more, delete {note} and use --store with this restore: "
+                "then all drives store what it brings back.",
+            )
+
+
+def _is_about(note: Path, one: Recorded, folder: Path, cut_off: Journal | None) -> bool:
+    """Whether a note is about this folder, which may have been moved since."""
+    try:
+        noted = _noted(note)
+    except ProfileError:
+        return cut_off is not None and _concerns(cut_off, one, same_place=True)
+    there = Path(noted["session"])
+    if there == folder.resolve():
+        return True
+    moved = cut_off is not None and noted.get("begun") == cut_off.begun
+    return moved and not _may_be_open(there / JOURNAL)
+
+
+def _refuse_noted(note: Path, one: Recorded, otherwise: str = "") -> None:
+    """Refuse to go on where a note is about something that was cut off; remove it where that ended."""
+    folder = _folder_of(note)
+    journal = _journal(folder / JOURNAL, note)
+    if not journal.is_open:
+        remove_durably(note)
+    elif _concerns(journal, one, same_place=True):
+        raise _refusal(folder, one.axis, journal, otherwise)
 
 
 def _forget(machine: str, recorded: Sequence["_Identified"]) -> None:
@@ -220,7 +279,9 @@ def _at_work(folder: Path) -> str:
     )
 
 
-def _refusal(folder: Path, axis: str, journal: Journal) -> UnfinishedWriteError:
+def _refusal(
+    folder: Path, axis: str, journal: Journal, otherwise: str = ""
+) -> UnfinishedWriteError:
     if is_at_work(folder):
         return UnfinishedWriteError(f"{axis}: {_at_work(folder)}")
     what = (
@@ -229,7 +290,8 @@ def _refusal(folder: Path, axis: str, journal: Journal) -> UnfinishedWriteError:
         else "a measurement was cut off, and the drives may hold what it had set for its time"
     )
     return UnfinishedWriteError(
-        f"{axis}: {what}. Take it back first: fieldtool restore {folder}. Nothing was moved or written."
+        f"{axis}: {what}. Take it back first: fieldtool restore {folder}.{otherwise} Nothing was moved "
+        "or written."
     )
 
 
@@ -253,18 +315,24 @@ def _note_of(machine: str, drive: Recorded) -> Path:
     return state_folder() / name
 
 
+def _noted(note: Path) -> Mapping[str, Any]:
+    """Return what a note says; raise ProfileError if it is none."""
+    data: Mapping[str, Any]
+    data, _ = read_yaml(note, 100_000)
+    if data.get("format") != FORMAT or not isinstance(data.get("session"), str):
+        raise ProfileError(note, f"format must be {FORMAT}")
+    return data
+
+
 def _folder_of(note: Path) -> Path:
     try:
-        data, _ = read_yaml(note, 100_000)
-        if data.get("format") != FORMAT or not isinstance(data.get("session"), str):
-            raise ProfileError(note, f"format must be {FORMAT}")
+        return Path(_noted(note)["session"])
     except ProfileError as error:
         raise UnfinishedWriteError(
             f"{error}. It says where the journal of a write is that was cut off. Use `fieldtool "
             "restore` with that session's folder, or delete the file if you know that the drives are "
             "in order. Nothing was moved or written."
         ) from error
-    return Path(data["session"])
 
 
 def _journal(journal_file: Path, note: Path) -> Journal:
@@ -273,8 +341,10 @@ def _journal(journal_file: Path, note: Path) -> Journal:
     except ProfileError as error:
         raise UnfinishedWriteError(
             f"something that had changed these drives was cut off, and its journal is not to be had: "
-            f"{error}. If the folder was moved, use `fieldtool restore` with where it is now; if the "
-            f"drives were brought in order elsewhere, delete {note}. Nothing was moved or written."
+            f"{error}. If the folder was moved, use `fieldtool restore` with where it is now. If it is "
+            f"gone, delete {note}; unless the drives were brought in order elsewhere, bring a backup "
+            "back then, and store it in all drives: fieldtool restore BACKUP --store. Nothing was moved "
+            "or written."
         ) from error
 
 
@@ -314,7 +384,7 @@ def _same_drive(journal: Journal, drives: Iterable[_Identified], *, own: bool) -
     return next((d.axis for d in drives if _concerns(journal, d, same_place=own)), None)
 
 
-def _concerns(journal: Journal, drive: _Identified, *, same_place: bool) -> bool:
+def _concerns(journal: Journal, drive: Recorded, *, same_place: bool) -> bool:
     """Whether an open journal holds this drive, and it was not brought back.
 
     Drives without a serial number are told by their node id, where the place is known to be the same.

@@ -22,6 +22,8 @@ pytestmark = pytest.mark.usefixtures("untried")
 TABLE, ARM = 11, 12
 VELOCITY_P, VELOCITY_I, POSITION_P = (0x2010, 2), (0x2010, 3), (0x2010, 1)
 NEW = {"velocity_p": 2.0, "velocity_i": 16.0, "position_p": 20.0}
+CUT_OFF = "a write of parameters was cut off, and the drives may hold old and new ones mixed"
+LONG_AGO = "2026-01-02T03:04:05+00:00"
 PER_DRIVE = 3
 """Objects written to each drive."""
 
@@ -306,6 +308,194 @@ def test_notes_of_a_write_that_has_ended_are_forgotten(session, cut_off):
     make_session(session, other)
     assert session.command("write", other, "--yes").code == 0
     assert notes() == []
+
+
+# --- the restore of another folder ---------------------------------------------------------------
+
+
+@pytest.fixture
+def other(session):
+    """A folder of an earlier session with the same machine, far from the one that is cut off."""
+    folder = session.folder / "far" / "earlier"
+    make_session(session, folder)
+    assert session.command("write", folder, "--yes").code == 0
+    assert session.command("restore", folder).code == 0
+    assert session.changed() == {}
+    assert notes() == []
+    return folder
+
+
+def cut_off_in_the_middle_of_storing(cut_off):
+    """One drive has stored new values; the other has old ones in its non-volatile memory."""
+    journal = cut_off(2 * PER_DRIVE + 2, store=True)
+    assert [r.memory for r in journal.drives] == [Memory.NEW, Memory.UNKNOWN]
+
+
+def refused(session, *restore):
+    """Return why a restore is refused; nothing is written then, and no note is touched."""
+    held_then, noted = session.objects(), {note: note.read_bytes() for note in notes()}
+    outcome = session.command("restore", *restore)
+    assert outcome.code == 3, outcome.err
+    assert session.objects() == held_then
+    assert {note: note.read_bytes() for note in notes()} == noted
+    return in_one_line(outcome.err)
+
+
+def begun_long_ago(folder):
+    """Let a journal, and the notes about it, be of another second than what follows."""
+    journal = folder / "write-journal.yaml"
+    began = load_journal(journal).begun
+    forged(journal, lambda data: data.update(begun=LONG_AGO))
+    for note in notes():
+        note.write_text(note.read_text().replace(began, LONG_AGO))
+
+
+@pytest.mark.parametrize("options", [(), ("--store",), ("--without", "arm")])
+@pytest.mark.parametrize("source", [".", "parameters-before.yaml"])
+def test_the_restore_of_another_folder_takes_nothing_back(session, cut_off, other, options, source):
+    """It does not know what the drives have stored: they would be mixed after a power cycle."""
+    cut_off_in_the_middle_of_storing(cut_off)
+    said = refused(session, other / source, *options)
+    assert f"table: {CUT_OFF}. Take it back first: fieldtool restore {session.out}." in said
+    assert session.command("write", other, "--yes").code == 3, "the next session is still refused"
+    assert session.command("restore", session.out).code == 0
+    assert session.command("restore", other / source, *options).code == 0
+    power_cycle(session)
+    assert session.changed() == {}
+
+
+def test_a_drive_that_is_left_out_keeps_its_note(session, cut_off, other):
+    """What is noted of a drive that is gone is not lost by a restore of another folder without it."""
+    cut_off_in_the_middle_of_storing(cut_off)
+    assert session.command("restore", session.out, "--without", "arm").code == 0
+    assert len(notes()) == 1
+    assert f"arm: {CUT_OFF}" in refused(session, other, "--without", "arm")
+    assert session.command("restore", session.out).code == 0
+    assert session.command("restore", other, "--without", "arm").code == 0
+
+
+def test_a_copy_is_refused_as_long_as_its_original_is_there(session, cut_off):
+    cut_off_in_the_middle_of_storing(cut_off)
+    copy = session.folder / "copies" / "copy"
+    shutil.copytree(session.out, copy)
+    assert f"fieldtool restore {session.out}." in refused(session, copy)
+    shutil.rmtree(session.out)
+    assert session.command("restore", copy).code == 0
+    power_cycle(session)
+    assert session.changed() == {}
+    assert notes() == []
+
+
+def test_the_restore_of_a_moved_folder_can_be_cut_off_and_repeated(session, cut_off, monkeypatch):
+    """Also between its journal and its notes, which still say where the folder was."""
+    cut_off_in_the_middle_of_storing(cut_off)
+    begun_long_ago(session.out)
+    moved = session.folder / "elsewhere" / "moved"
+    moved.parent.mkdir()
+    session.out.rename(moved)
+
+    def die(*_):
+        raise HostDiedError
+
+    with monkeypatch.context() as patch, pytest.raises(HostDiedError):
+        patch.setattr(unfinished.JournalKeeper, "_note", die)
+        session.command("restore", moved)
+    assert all(str(moved) not in note.read_text() for note in notes())
+    for number in (1, 3):
+        for _ in die_at(monkeypatch, number):
+            with pytest.raises(HostDiedError):
+                session.command("restore", moved)
+        assert all(str(moved) in note.read_text() for note in notes())
+    assert session.command("restore", moved).code == 0
+    power_cycle(session)
+    assert session.changed() == {}
+    assert notes() == []
+
+
+def test_another_restore_that_was_cut_off_does_not_pass_for_the_moved_folder(
+    session, cut_off, other, monkeypatch
+):
+    """A folder that is moved is known by when its write began, not by being open."""
+    for _ in die_at(monkeypatch, 1):
+        with pytest.raises(HostDiedError):
+            session.command("restore", other, "--store")
+    assert load_journal(other / "write-journal.yaml").is_open
+    begun_long_ago(other)
+    for note in notes():  # of a computer that has not seen it
+        note.unlink()
+    cut_off_in_the_middle_of_storing(cut_off)
+    session.out.rename(session.folder / "moved")
+    assert "If the folder was moved" in refused(session, other)
+
+
+def test_a_folder_that_is_gone_for_good_leaves_a_way_out(session, cut_off, other):
+    cut_off_in_the_middle_of_storing(cut_off)
+    shutil.rmtree(session.out)
+    for note in notes():
+        said = refused(session, other)
+        assert f"If it is gone, delete {note};" in said
+        assert "fieldtool restore BACKUP --store" in said
+        note.unlink()
+    assert session.command("restore", other, "--store").code == 0
+    power_cycle(session)
+    assert session.changed() == {}
+
+
+def test_a_folder_that_can_not_be_restored_leaves_a_way_out(session, cut_off, other):
+    cut_off_in_the_middle_of_storing(cut_off)
+    (session.out / "parameters-before.yaml").write_text("damaged")
+    assert session.command("restore", session.out).code == 2
+    for note in notes():
+        assert f"delete {note} and use --store" in refused(session, other)
+        note.unlink()
+    assert session.command("restore", other, "--store").code == 0
+    power_cycle(session)
+    assert session.changed() == {}
+
+
+def test_a_note_that_can_not_be_read_keeps_only_the_others_from_being_restored(
+    session, cut_off, other
+):
+    cut_off_in_the_middle_of_storing(cut_off)
+    for note in notes():
+        note.write_text("[")
+    assert str(notes()[0]) in refused(session, other)
+    assert session.command("restore", session.out).code == 0
+    assert session.command("restore", other).code == 0
+    assert notes() == []
+
+
+def test_a_note_of_what_has_ended_keeps_no_folder_from_being_restored(session, cut_off, other):
+    cut_off_in_the_middle_of_storing(cut_off)
+    kept = {note: note.read_text() for note in notes()}
+    assert session.command("restore", session.out).code == 0
+    for note, text in kept.items():
+        note.write_text(text)
+    assert session.command("restore", other).code == 0
+    assert notes() == []
+
+
+def test_another_machine_with_the_same_node_ids_is_restored(session, cut_off, make_bench):
+    cut_off_in_the_middle_of_storing(cut_off)
+    noted = {note: note.read_bytes() for note in notes()}
+    second = make_bench(session.data | {}, serial=9999)
+    folder = session.folder / "second" / "machine"
+    make_session(second, folder)
+    assert second.command("write", folder, "--yes").code == 0
+    assert second.command("restore", folder).code == 0
+    assert {note: note.read_bytes() for note in notes()} == noted
+
+
+def test_a_journal_removes_no_note_about_another_folder(session, cut_off, other):
+    cut_off_in_the_middle_of_storing(cut_off)
+    noted = notes()
+    ended = load_journal(other / "write-journal.yaml")
+    assert {r.phase for r in ended.drives} == {Phase.ROLLED_BACK}
+    keeper = unfinished.JournalKeeper(other / "write-journal.yaml")
+    keeper(ended)
+    keeper.settle(ended)
+    keeper.forget(ended, None)
+    assert notes() == noted
 
 
 # --- files are not trusted -----------------------------------------------------------------------
