@@ -61,6 +61,9 @@ class CanopenDrive:
         self._scaled: Scaled | None = None
         self.left_changed = False
         """Whether something that was set for a time could not be put back."""
+        self.boots = 0
+        """Boot-up messages of it that nobody had asked for: what was not stored in it is lost then."""
+        line.subscribe(0x700 + self.node_id, self._on_heartbeat)
         self.learned = Learned()
         """What its motion has shown so far; learned while it moves."""
         self.answer = Answer()
@@ -352,18 +355,16 @@ class CanopenDrive:
         patience
             Seconds to wait for its boot-up message, and for its answers, at most.
         """
-        booted: list[bool] = []
-
-        def heard(_id: int, data: bytearray, _time: float) -> None:
-            booted.extend([True] if bytes(data) == b"\0" else [])
-
-        self.line.subscribe(0x700 + self.node_id, heard)
+        before = self.boots
         try:
             self.node.nmt.send_command(RESET_NODE)
-            self.line.wait(patience, lambda: bool(booted))
+            booted = self.line.wait(patience, lambda: self.boots != before)
         finally:
-            self.line.unsubscribe(0x700 + self.node_id, heard)
-        return bool(booted) and self.wakes(patience)
+            self.boots = before
+        return booted and self.wakes(patience)
+
+    def _on_heartbeat(self, _id: int, data: bytearray, _time: float) -> None:
+        self.boots += bytes(data) == b"\0"
 
     @property
     def unasked_answers(self) -> int:

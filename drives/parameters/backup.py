@@ -5,17 +5,18 @@ import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import yaml
 
 from drives.canopen_drive import CanopenDrive
-from drives.errors import ProfileError, SdoAbortError
+from drives.errors import DriveFaultError, ProfileError, SdoAbortError
 from drives.objects import DATA_TYPES, ObjectAddress, ObjectInfo
 from drives.parameters.durable import write_durably
 from drives.parameters.set_up import read_set_up
-from drives.parameters.values import HeldObject, checked_value
+from drives.parameters.values import HeldObject, Raw, checked_value, read_twice
 from drives.profile import read_yaml
 
 FORMAT = "fieldtool-parameters/1"
@@ -56,19 +57,23 @@ def back_up(machine: str, drives: Iterable[CanopenDrive]) -> Backup:
 
     Left out are write-only objects, and those whose value could not be written again: numbers that
     are not finite, text that is no ASCII.
+
+    Raises
+    ------
+    NotSupportedError
+        If an object is read as one value, and then as another.
+    DriveFaultError
+        If a drive restarts meanwhile: what was not stored in it is lost.
+    SdoError
+        If a drive does not answer.
     """
     parts = []
     for drive in drives:
-        held = []
+        held, boots = [], drive.boots
         for info in drive.writable_parameters():
-            try:
-                one = HeldObject(info, drive.read(info))
-            except SdoAbortError as error:
-                if error.code not in (0x06010001, 0x06020000, 0x06090011):
-                    raise
-                continue
-            if _can_be_written(one):
-                held.append(one)
+            value = read_twice(drive.axis, info, partial(_read, drive, info), _CHANGES)
+            if value is not None:
+                held.append(HeldObject(info, value))
         identity = drive.identity
         parts.append(
             DriveBackup(
@@ -82,15 +87,29 @@ def back_up(machine: str, drives: Iterable[CanopenDrive]) -> Backup:
                 read_set_up(drive),
             )
         )
+        if drive.boots != boots:
+            raise DriveFaultError(
+                f"{drive.axis}: node {drive.node_id} has restarted while its parameters were read, and "
+                "lost what was not stored in it. Check its supply, and try again. Nothing was written."
+            )
     return Backup(machine, datetime.now(UTC).isoformat(timespec="seconds"), tuple(parts))
 
 
-def _can_be_written(held: HeldObject) -> bool:
+_CHANGES = "; if the drive changes it by itself, add it to `volatile_commands` in the drive profile"
+
+
+def _read(drive: CanopenDrive, info: ObjectInfo) -> Raw | None:
+    """Return what an object holds; None where that could not be written again."""
     try:
-        held.info.encode(held.value)
+        value = drive.read(info)
+        info.encode(value)
+    except SdoAbortError as error:
+        if error.code not in (0x06010001, 0x06020000, 0x06090011):
+            raise
+        return None
     except ValueError:
-        return False
-    return True
+        return None
+    return value
 
 
 def save_backup(backup: Backup, path: Path) -> None:

@@ -81,9 +81,11 @@ def look(drive: ParameterDrive, record: DriveRecord) -> Found:
 
 
 def bring_back(
-    drive: ParameterDrive, record: DriveRecord, backup: DriveBackup, *, whole: bool
+    drive: ParameterDrive, record: DriveRecord, backup: DriveBackup, *, set_up: bool
 ) -> BroughtBack:
     """Write every old value that the drive does not hold, and read all of them back.
+
+    All of the backup is compared: a drive that lost its supply has lost more than what was written.
 
     Parameters
     ----------
@@ -94,10 +96,9 @@ def bring_back(
         Whose entries come back in any case.
     backup
         Every parameter of the drive.
-    whole
-        Bring the whole backup back, and what a motion had set up, where the backup holds that.  The
-        parameters come back too where the drive holds values of neither side, as after a reboot: then
-        it has lost more than what was written.
+    set_up
+        Bring back what a motion had set up too, where the backup holds that, and have the drive take
+        all of its parameters over: bringing back may have been cut off before.
 
     Raises
     ------
@@ -111,10 +112,9 @@ def bring_back(
     _see_disabled(drive)
     found = look(drive, record)
     unlock(drive)
-    set_up, not_set_up = bring_set_up_back(drive, backup.set_up) if whole else ((), {})
-    wanted = {entry.info.address: HeldObject(entry.info, entry.before) for entry in record.entries}
-    if whole or found is Found.OTHER:
-        wanted = {held.info.address: held for held in backup.held} | wanted
+    was_set_up, not_set_up = bring_set_up_back(drive, backup.set_up) if set_up else ((), {})
+    wanted = {held.info.address: held for held in backup.held}
+    wanted |= {entry.info.address: HeldObject(entry.info, entry.before) for entry in record.entries}
     left = _in_order(drive, wanted.values())
     written: list[HeldObject] = []
     failed: dict[ObjectAddress, str] = {}
@@ -123,14 +123,19 @@ def bring_back(
         left, failed = _one_pass(drive, left, written)
         if not left or len(left) == before:
             break
-    take_over(drive, {held.info.address for held in written})
+    # Not what was written now alone: what was written before a cut may wait for its latch.
+    to_take = {e.info.address for e in record.entries if not same(e.info, e.before, e.after)}
+    take_over(drive, to_take | {h.info.address for h in (wanted.values() if set_up else written)})
     # Only what was read back in the end counts: a later value may have changed an earlier one.
     for held in tuple(written):
-        value = _read(drive, held)
-        if not (isinstance(value, _Unread) or same(held.info, value, held.value)):
+        for _ in range(2):  # one answer that is wrong says nothing of the drive
+            value = _read(drive, held)
+            if isinstance(value, _Unread) or _same(drive, held, value):
+                break
+        else:
             failed[held.info.address] = f"{value}, was {held.value}"
     kept = tuple(held for held in written if held.info.address not in failed)
-    return BroughtBack(found, (*set_up, *kept), {**not_set_up, **failed})
+    return BroughtBack(found, (*was_set_up, *kept), {**not_set_up, **failed})
 
 
 class _Unread(str):
@@ -146,18 +151,26 @@ def _one_pass(
     left, failed = [], {}
     for held in wanted:
         value = _read(drive, held)
-        if isinstance(value, _Unread) or not same(held.info, value, held.value):
+        if isinstance(value, _Unread) or not _same(drive, held, value):
             refusal = _write(drive, held)
             value = _read(drive, held)
             if isinstance(value, _Unread):
                 failed[held.info.address] = f"not known ({refusal or value})"
-            elif not same(held.info, value, held.value):
+            elif not _same(drive, held, value):
                 failed[held.info.address] = f"{value}, was {held.value}"
             else:
                 written.append(held)
                 continue
             left.append(held)
     return left, failed
+
+
+def _same(drive: ParameterDrive, held: HeldObject, value: Raw) -> bool:
+    """Whether an object holds its old value; a latch is a command, whatever its bits show."""
+    for latch in drive.profile.latches:
+        if latch.object == held.info.address:
+            return not (int(value) ^ int(held.value)) & ~latch.set_bits
+    return same(held.info, value, held.value)
 
 
 def _read(drive: ParameterDrive, held: HeldObject) -> Raw | _Unread:

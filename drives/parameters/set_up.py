@@ -24,7 +24,7 @@ from drives.canopen_drive.setup import (
 from drives.canopen_drive.torque_offset import TORQUE_OFFSET
 from drives.errors import DrivesError, ProfileError, SdoAbortError
 from drives.objects import ObjectAddress, ObjectInfo
-from drives.parameters.values import HeldObject, ParameterDrive, same
+from drives.parameters.values import HeldObject, ParameterDrive, read_twice, same
 
 MOST_ENTRIES = 64
 """That a PDO can map (CiA 301, clause 7.5.2.36)."""
@@ -35,6 +35,8 @@ def read_set_up(drive: ParameterDrive) -> tuple[HeldObject, ...]:
 
     Raises
     ------
+    NotSupportedError
+        If an object is read as one value, and then as another.
     SdoError
         If the drive does not answer.
     """
@@ -56,10 +58,15 @@ def read_set_up(drive: ParameterDrive) -> tuple[HeldObject, ...]:
 
 def _held(drive: ParameterDrive, info: ObjectInfo) -> Iterator[HeldObject]:
     """Yield what an object holds; nothing where the drive refuses to tell: then no motion changes it."""
-    with suppress(SdoAbortError):
-        value = drive.read_optional(info)
-        if value is not None:
-            yield HeldObject(info, value)
+
+    def read() -> int | None:
+        with suppress(SdoAbortError):
+            return drive.read_optional(info)
+        return None
+
+    value = read_twice(drive.axis, info, read)
+    if value is not None:
+        yield HeldObject(info, value)
 
 
 def check_set_up(axis: str, held: Sequence[HeldObject], path: Path) -> None:

@@ -25,6 +25,7 @@ from drives.parameters.journal import (
     Journal,
     JournalEntry,
     Memory,
+    Phase,
     Step,
     Storing,
     next_step,
@@ -74,6 +75,9 @@ class Transaction:
         Asked before each drive stores and before the write ends: a stop takes the write back.
     wanted
         What new values are in physical units, in words, by axis and object; for messages.
+    boots
+        How often each drive had booted, by axis, before the backup was taken: one that has booted since
+        has lost what was not stored, and the write is taken back.  Without, what they have now.
     """
 
     def __init__(
@@ -86,10 +90,12 @@ class Transaction:
         prove: Prove | None = None,
         stop_requested: Callable[[], bool] = lambda: False,
         wanted: Mapping[tuple[str, ObjectAddress], str] | None = None,
+        boots: Mapping[str, int] | None = None,
     ) -> None:
         self._wanted = wanted or {}
         self._tell, self._prove, self._stop_requested = tell, prove, stop_requested
         self._drives = {drive.axis: drive for drive in drives}
+        self._boots = dict(boots or {axis: drive.boots for axis, drive in self._drives.items()})
         self._backups = {part.axis: part for part in backup.drives}
         self._save = save
         self.journal = journal
@@ -149,7 +155,18 @@ class Transaction:
         if self._stop_requested():
             raise UserStopError(STOPPED_AT_REST)
 
+    def _refuse_restarted(self) -> None:
+        """End the write if a drive has lost its supply: also where it holds all that was written."""
+        for axis, drive in self._drives.items():
+            stored = self._record(axis).phase is Phase.STORED
+            if drive.boots != self._boots[axis] and not stored:
+                raise MismatchError(
+                    f"{axis}: node {drive.node_id} has restarted since its parameters were backed up, "
+                    "and lost what was not stored in it. Check its supply"
+                )
+
     def _step_forward(self, step: Step) -> None:
+        self._refuse_restarted()
         self._tell(step)
         drive = self._drives.get(step.axis)
         if step.action in (Action.STORE, Action.FINISH):
@@ -238,7 +255,8 @@ class Transaction:
     def _take_back(self, cause: BaseException) -> None:
         """Go back after a failure; raise what says how that ended, unless it was a stop."""
         with uninterrupted():
-            self._back_again(self.journal.turned_back(distrust=False), whole=False)
+            # Where one lost its supply, so may have one to which nothing was written yet.
+            self._back_again(self.journal.turned_back(distrust=self._begun), set_up=False)
         reason = str(cause).rstrip(".") or type(cause).__name__
         try:
             self._refuse_or_say(reason, cause)
@@ -288,7 +306,7 @@ class Transaction:
         try:
             with uninterrupted():
                 self._save(self.journal)
-                self._back_again(self.journal, whole=True)
+                self._back_again(self.journal, set_up=True)
                 self._refuse_mixed("not everything could be restored", None)
                 done = True
         except BaseException as error:
@@ -297,16 +315,16 @@ class Transaction:
                 error.add_note(f"The restore had ended: all drives{but} hold the old values.")
             raise
 
-    def _back_again(self, journal: Journal, *, whole: bool) -> None:
+    def _back_again(self, journal: Journal, *, set_up: bool) -> None:
         """Bring back until all drives hold their old values at the same time."""
         self._go_quietly(journal)
         for _ in range(ROUNDS):
-            self._back(whole=whole)
+            self._back(set_up=set_up)
             if all(outcome.trouble != _LOST for outcome in self.outcomes.values()):
                 return
             self._go_quietly(self.journal.turned_back(distrust=True))
 
-    def _back(self, *, whole: bool) -> None:
+    def _back(self, *, set_up: bool) -> None:
         given_up = set(self._left_out)
         for outcome in self.outcomes.values():
             outcome.trouble = ""
@@ -320,7 +338,7 @@ class Transaction:
                     if given_up:
                         continue
                 elif step.action is Action.BRING_BACK:
-                    self._bring_back(step.axis, whole=whole)
+                    self._bring_back(step.axis, set_up=set_up)
                 else:
                     self._store(self._drives[step.axis])
             except DrivesError as error:
@@ -334,12 +352,12 @@ class Transaction:
         for axis, outcome in self.outcomes.items():
             outcome.memory = self._record(axis).memory
 
-    def _bring_back(self, axis: str, *, whole: bool) -> None:
+    def _bring_back(self, axis: str, *, set_up: bool) -> None:
         outcome, drive = self.outcomes[axis], self._drives[axis]
-        whole = whole or drive.left_changed
+        set_up = set_up or drive.left_changed
         try:
             done: BroughtBack = bring_back(
-                drive, self._record(axis), self._backups[axis], whole=whole
+                drive, self._record(axis), self._backups[axis], set_up=set_up
             )
         except SilentDriveError:
             outcome.found = Found.SILENT

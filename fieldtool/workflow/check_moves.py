@@ -81,7 +81,9 @@ class MoveChecks:
                     with self._noted(group, folder):
                         self._plan_and_move(group)
                 finally:
-                    for text in group.warnings:
+                    left = [drive.axis for drive in group.drives if drive.left_changed]
+                    changed = f"{', '.join(left)}: not everything is as it was before"
+                    for text in group.warnings or ([changed] if left else []):
                         todo = f"Once all drives can be reached again: fieldtool restore {folder}"
                         self._findings.note("put back", "fail", text, todo=todo)
                     self._pace(group, bus)

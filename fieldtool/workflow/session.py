@@ -261,9 +261,10 @@ def open_session(
             for text in (*group.warnings, trace_problem(group.line.can_bus)):
                 if text:
                     session.warn(text)
-            if any(drive.left_changed for drive in group.drives):
+            if left := [drive.axis for drive in group.drives if drive.left_changed]:
                 session.warn(
-                    f"Once all drives can be reached again: fieldtool restore {folder.path}"
+                    f"{', '.join(left)}: not everything is as it was before. Once all drives can be "
+                    f"reached again: fieldtool restore {folder.path}"
                 )
     except BaseException as error:
         folder.note("ended", error=type(error).__name__, text=str(error))

@@ -21,7 +21,11 @@ def take_backup(machine: str, drives: Sequence[CanopenDrive], path: Path) -> Pat
     OutputError
         If the file can not be written; then nothing may be changed.
     """
-    backup = back_up(machine, drives)
+    return keep_backup(back_up(machine, drives), path)
+
+
+def keep_backup(backup: Backup, path: Path) -> Path:
+    """Write a backup that was just taken to a file, as :func:`take_backup`."""
     for candidate in _names(path):
         try:
             if candidate.exists():

@@ -21,8 +21,9 @@ def backed_up(machine: str, drives: Sequence[CanopenDrive], backup_path: Path) -
 
     A measurement switches feed-forward off, arms fail-safe objects and maps PDOs, and puts all of it
     back when it ends, however it ends.  If the tool is killed, or a drive can not be reached any more,
-    it can not; then the note makes the next session ask for ``fieldtool restore``, so that no later
-    backup takes such values for the machine's own.
+    it can not; and a drive that restarts has lost what was not stored in it.  Then the note makes the
+    next session ask for ``fieldtool restore``, so that no later backup takes such values for the
+    machine's own.
     The journal of a write that has ended is put back afterwards: it says what the drives have stored.
 
     Raises
@@ -30,6 +31,7 @@ def backed_up(machine: str, drives: Sequence[CanopenDrive], backup_path: Path) -
     OutputError
         If backup or note can not be written; nothing was changed.
     """
+    boots = {drive.axis: drive.boots for drive in drives}
     backup = take_backup(machine, drives, backup_path)
     keeper = JournalKeeper(backup.with_name(JOURNAL))
     earlier = left_before(keeper.path, drives)
@@ -44,11 +46,13 @@ def backed_up(machine: str, drives: Sequence[CanopenDrive], backup_path: Path) -
         try:
             yield
         finally:
+            for drive in drives:
+                drive.left_changed |= drive.boots != boots[drive.axis]
             left = [drive.axis for drive in drives if drive.left_changed]
             if not left:
                 keeper.forget(journal, before)
             elif (cause := sys.exc_info()[1]) is not None:
                 cause.add_note(
-                    f"{', '.join(left)}: not everything could be put back as it was. Once all drives "
+                    f"{', '.join(left)}: not everything is as it was before. Once all drives "
                     f"can be reached again: fieldtool restore {backup.parent}"
                 )

@@ -9,6 +9,7 @@ from drives.canopen_drive import CanopenDrive
 from drives.errors import NotSupportedError
 from drives.parameters import (
     Action,
+    Backup,
     Change,
     DriveRecord,
     Journal,
@@ -18,14 +19,16 @@ from drives.parameters import (
     Storing,
     Transaction,
     Written,
+    back_up,
     check_can_store,
     check_disabled,
     load_backup,
     planned_changes,
 )
+from drives.parameters.values import same
 from drives.profile import Store
 from fieldtool.design.tuning import Tuning
-from fieldtool.writeback.backups import take_backup
+from fieldtool.writeback.backups import keep_backup
 from fieldtool.writeback.earlier import left_before
 from fieldtool.writeback.unfinished import JOURNAL, JournalKeeper, not_kept, refuse_unfinished
 
@@ -105,7 +108,7 @@ def apply(
     changes
         What is to be written, in the order of writing: :func:`changes_for`.
     backup_path
-        File for the backup, written before the first change; see :func:`take_backup`.
+        File for the backup, written before the first change; see :func:`keep_backup`.
     confirm
         Sees old and new values and says whether to write.
     keep
@@ -123,7 +126,8 @@ def apply(
     UnfinishedWriteError
         If a write before was cut off; nothing was changed.
     NotSupportedError, DriveFaultError
-        If a value does not fit or a drive is enabled; nothing was changed.
+        If a value does not fit, an old one was read differently for the backup, or a drive is enabled;
+        nothing was changed.
     OutputError
         If backup or journal can not be written; nothing was changed.
     WriteBackError
@@ -138,7 +142,10 @@ def apply(
     if keep:
         for drive in drives:
             check_can_store(drive)
-    backup_path = take_backup(machine, drives, backup_path)
+    boots = {drive.axis: drive.boots for drive in drives}
+    taken = back_up(machine, drives)
+    check_agreed(drives, changes, taken)
+    backup_path = keep_backup(taken, backup_path)
     if not confirm(changes):
         return WriteBack((), changes, in_memory=False, stored=False, backup=backup_path)
     check_disabled(drives)
@@ -150,7 +157,9 @@ def apply(
     backup = load_backup(backup_path)
     wanted = {(one.axis, one.info.address): one.wanted for one in changes}
     tell = tell_storing(drives, say)
-    transaction = Transaction(drives, journal, backup, keeper, tell, prove, stop_requested, wanted)
+    transaction = Transaction(
+        drives, journal, backup, keeper, tell, prove, stop_requested, wanted, boots
+    )
     try:
         with keeper:
             transaction.write()
@@ -158,6 +167,31 @@ def apply(
         raise not_kept(keeper, error) from error
     written = tuple(Written(change, change.after) for change in changes)
     return WriteBack(written, changes, in_memory=True, stored=keep, backup=backup_path)
+
+
+def check_agreed(drives: Sequence[CanopenDrive], changes: Sequence[Change], backup: Backup) -> None:
+    """Refuse to write where an old value is not what the backup holds: one of the two is wrong.
+
+    What is in no backup is read once more.
+
+    Raises
+    ------
+    NotSupportedError
+        With axis, object and both values.
+    """
+    by_axis = {drive.axis: drive for drive in drives}
+    held = {(part.axis, h.info.address): h.value for part in backup.drives for h in part.held}
+    for change in changes:
+        again = held.get((change.axis, change.info.address))
+        if again is None:
+            again = by_axis[change.axis].read(change.info)
+        if not same(change.info, change.before_raw, again):
+            raise NotSupportedError(
+                f"{change.axis}, {change.name}, object {change.info.address}: read as "
+                f"{change.before_raw}, then as {again}, so what would have to be restored is not known. "
+                "Check the drive's supply and the bus, and that nobody else writes to the drive, and "
+                "try again. Nothing was written."
+            )
 
 
 def tell_storing(

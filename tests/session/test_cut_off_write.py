@@ -11,10 +11,11 @@ import pytest
 import yaml
 
 from drives.canopen_drive import CanopenDrive, connect
+from drives.errors import SafetyStopError
 from drives.parameters import Memory, Phase, Transaction, load_journal, save_journal
 from drives.parameters.backup import checksum
 from drives.profile import load_machine
-from drives.sim.faults import DriveFault, NodeVanishes
+from drives.sim.faults import DriveFault, NodeVanishes, PowerLoss
 from fieldtool.writeback import unfinished
 from fieldtool.writeback.temporary import backed_up
 
@@ -657,6 +658,35 @@ def test_a_session_at_work_is_not_taken_for_one_that_was_cut_off(bench):
         assert "another fieldtool is at work" in outcome.err
         assert "cut off" not in outcome.err
     assert bench.command("restore", folder).code == 0
+
+
+def test_a_measurement_in_which_a_drive_rebooted_has_to_be_restored(bench):
+    """What was not stored in it is lost; all that the measurement had set is put back."""
+    bench.machine.node(ARM).dictionary.write(0x2010, 6, 777_000)
+    bench.before = bench.objects()
+    folder = bench.out
+    folder.mkdir()
+    (folder / "machine.yaml").write_text(bench.profile.read_text())
+    with connect(load_machine(bench.profile)) as group:
+
+        def rebooted():
+            with backed_up("bench", group.drives, folder / "parameters-before.yaml"):
+                bench.inject(PowerLoss(ARM))
+                group.drives[1].wait(0.1)
+                raise SafetyStopError("it rebooted")
+
+        with pytest.raises(SafetyStopError) as ended:
+            rebooted()
+    (note,) = ended.value.__notes__
+    assert note.startswith("arm: not everything is as it was before.")
+    assert note.endswith(f"fieldtool restore {folder}")
+    other = bench.command("measure", bench.profile, "--out", bench.folder / "other")
+    assert other.code == 3
+    assert f"fieldtool restore {folder}" in in_one_line(other.err)
+    assert set(bench.changed()[ARM]) == {"0x2010:06"}
+    assert bench.command("restore", folder).code == 0
+    assert bench.changed() == {}
+    assert notes() == []
 
 
 # --- what was stored before ----------------------------------------------------------------------

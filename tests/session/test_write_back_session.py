@@ -25,6 +25,7 @@ from drives.sim.faults import (
     StoreForgets,
     WriteAltered,
 )
+from drives.sim.wire import unchanged
 from tests.untried import Stood
 
 pytestmark = pytest.mark.usefixtures("untried")
@@ -361,6 +362,55 @@ def test_a_drive_that_reboots_while_it_is_written_holds_old_values_in_the_end(se
     dictionary.alterations[VELOCITY_I] = lambda v: session.inject(PowerLoss(ARM)) or v
     outcome = write(session)
     assert outcome.code == 6, outcome.err
+    assert session.changed() == {}
+
+
+def test_a_drive_that_reboots_while_it_is_written_gets_back_what_was_not_stored_too(session):
+    """Its stored gains are the old ones, so that they do not show what it has lost."""
+    node = session.machine.node(ARM)
+    node.dictionary.write(0x2010, 6, 777_000)
+    session.before = session.objects()
+
+    def reboot(value):
+        del node.dictionary.alterations[VELOCITY_I]
+        session.inject(PowerLoss(ARM))
+        return value
+
+    node.dictionary.alterations[VELOCITY_I] = reboot
+    outcome = write(session)
+    assert outcome.code == 6, outcome.err
+    assert "Nothing was changed: all parameters were restored" in " ".join(outcome.err.split())
+    assert session.changed() == {}
+
+
+@pytest.mark.parametrize("number", range(1, 10))
+def test_one_wrong_answer_is_never_written_back(session, number):
+    """It may be any of those about a gain; the write fails at another one, so all is taken back."""
+    seen = []
+
+    def alter(cob_id, data):
+        if cob_id == 0x580 + ARM and data[0] >> 5 == 2 and data[1:4] == b"\x10\x20\x02":
+            seen.append(data)
+            if len(seen) == number:
+                data = data[:4] + bytes((data[4], data[5] ^ 4)) + data[6:]
+        return unchanged(cob_id, data)
+
+    session.machine.wire.from_nodes["wrong answer"] = alter
+    session.machine.node(ARM).dictionary.guards[POSITION_P] = lambda _: 0x08000022
+    outcome = write(session)
+    said = " ".join(outcome.err.split())
+    assert len(seen) >= number, "there was such an answer"
+    assert outcome.code in (3, 6), said
+    if outcome.code == 3:
+        assert "arm, " in said
+        assert "object 0x2010:02" in said
+        assert "1200" in said
+        assert "176" in said
+        assert "Nothing was written" in said
+        assert not (session.out / "parameters-before.yaml").exists()
+    assert session.changed() == {}
+    del session.machine.wire.from_nodes["wrong answer"]
+    assert session.command("restore", session.out).code in (0, 2)
     assert session.changed() == {}
 
 

@@ -14,7 +14,9 @@ from drives.canopen_drive.recovery import recover
 from drives.cia402 import PowerState
 from drives.errors import NotSupportedError, SdoAbortError
 from drives.objects import ObjectAddress, ObjectInfo, decode, encode
+from drives.parameters import DriveBackup, DriveRecord, HeldObject, JournalEntry, Phase
 from drives.parameters.access import take_over, unlock
+from drives.parameters.bring_back import bring_back
 from drives.parameters.changes import planned_changes, read_loop, read_parameters
 from drives.profile import load_drive, load_machine
 from drives.sim.faces import Motor, face_names, face_of
@@ -211,6 +213,54 @@ def test_a_latch_is_set_after_writing_and_keeps_the_other_bits(connected):
     assert node.dictionary.read(0x30AE, 0x40) == 0x2
     take_over(drive, {ObjectAddress(0x30AE, 0x20)})  # velocity P waits for no latch
     assert seen == [0x3]
+
+
+def dual_loop_going_back(entries):
+    """Return the record and the backup of a drive whose filter's coefficient was 1000."""
+    info = ObjectInfo(ObjectAddress(0x30AE, 0x10), "UNSIGNED32", "main_filter_a")
+    entry = JournalEntry(info, 1000, 2000)
+    record = DriveRecord("x", 5, 0, 0, 0, 7, (entry,) * entries, Phase.GOING_BACK)
+    latch = ObjectInfo(ObjectAddress(0x30AE, 0x40), "UNSIGNED16", "latch")
+    held = (HeldObject(info, 1000), HeldObject(latch, 0x2))
+    return record, DriveBackup("x", 5, 0, 0, 7, 0, held)
+
+
+@pytest.mark.parametrize(("entries", "set_up"), [(1, False), (1, True), (0, True)])
+def test_a_latch_is_set_again_where_bringing_back_was_cut_off_before_it(connected, entries, set_up):
+    """Old coefficients that wait for their latch look as if the drive worked with them."""
+    drive, node, _ = connected("epos4-dual-loop")
+    record, backup = dual_loop_going_back(entries)
+    node.dictionary.write(0x30AE, 0x10, 2000)
+    node.dictionary.force(0x30AE, 0x40, 0x2)
+    seen = []
+    latched = node.dictionary.effects[0x30AE, 0x40]
+    node.dictionary.effects[0x30AE, 0x40] = lambda value: (
+        seen.append((value, node.dictionary.read(0x30AE, 0x10))),
+        latched(value),
+    )
+    node.dictionary.guards[0x30AE, 0x40] = lambda _: 0x08000022
+    with pytest.raises(SdoAbortError):
+        bring_back(drive, record, backup, set_up=set_up)
+    assert node.dictionary.read(0x30AE, 0x10) == 1000
+    assert seen == []
+    del node.dictionary.guards[0x30AE, 0x40]
+    again = bring_back(drive, record, backup, set_up=set_up)
+    assert (again.written, again.failed) == ((), {})
+    assert seen == [(0x3, 1000)]
+
+
+@pytest.mark.parametrize("shown", [0x3, 0x2])
+def test_a_latch_that_stays_shown_is_nothing_that_could_not_be_brought_back(connected, shown):
+    """Where a drive keeps the bit, and where another bit of the object was changed meanwhile."""
+    drive, node, _ = connected("epos4-dual-loop")
+    record, backup = dual_loop_going_back(1)
+    node.dictionary.effects[0x30AE, 0x40] = lambda _: None
+    node.dictionary.write(0x30AE, 0x10, 2000)
+    node.dictionary.force(0x30AE, 0x40, shown ^ 0x2)
+    back = bring_back(drive, record, backup, set_up=False)
+    assert [h.value for h in back.written] == [1000, 0x2]
+    assert back.failed == {}
+    assert node.dictionary.read(0x30AE, 0x40) == 0x3
 
 
 class TestPassword:

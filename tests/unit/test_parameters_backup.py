@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drives.errors import ProfileError, SdoAbortError
+from drives.errors import DriveFaultError, NotSupportedError, ProfileError, SdoAbortError
 from drives.objects import ObjectAddress, ObjectInfo, type_range
 from drives.parameters import Backup, DriveBackup, HeldObject, back_up, load_backup, save_backup
 
@@ -23,6 +23,7 @@ class FakeDrive:
     values: dict[ObjectInfo, object]
     axis: str = "x"
     node_id: int = 5
+    boots: int = 0
 
     @property
     def identity(self):
@@ -36,6 +37,10 @@ class FakeDrive:
 
     def read(self, info):
         value = self.values[info]
+        if isinstance(value, list):
+            value = value.pop(0)
+        if value == "restarts":
+            self.boots += 1
         if isinstance(value, Exception):
             raise value
         return value
@@ -61,6 +66,46 @@ def test_what_could_not_be_written_again_is_left_out():
     )
     (part,) = back_up("machine", [drive]).drives
     assert [h.info.address.index for h in part.held] == [0x2005]
+
+
+@pytest.mark.parametrize(
+    ("answers", "said"),
+    [
+        ([1200, 176], "read as 1200, then as 176"),
+        ([176, 1200], "read as 176, then as 1200"),
+        ([math.nan, 5.0], "read as nothing that can be kept, then as 5.0"),
+        (
+            [SdoAbortError("x", 0x2000, 0, 0x06020000, "read"), 7],
+            "nothing that can be kept, then as 7",
+        ),
+    ],
+)
+def test_what_is_read_as_one_value_and_then_as_another_is_not_backed_up(answers, said):
+    """It would be written back."""
+    drive = FakeDrive({info("REAL32"): answers})
+    with pytest.raises(NotSupportedError, match=said) as refused:
+        back_up("machine", [drive])
+    assert "x, object 0x2000:00" in str(refused.value)
+    assert "volatile_commands" in str(refused.value)
+
+
+def test_what_a_motion_sets_up_is_read_two_times_as_well():
+    drive = FakeDrive({})
+    answers = {0x60B2: [100, 356]}
+    drive.read_optional = lambda info: answers.get(info.address.index, [0]).pop(0)
+    with pytest.raises(
+        NotSupportedError, match=r"x, object 0x60B2:00 .*: read as 100, then as 356"
+    ):
+        back_up("machine", [drive])
+
+
+def test_a_drive_that_restarts_while_it_is_read_is_not_backed_up():
+    """One half would be what it held, the other what was stored."""
+    drive = FakeDrive({info("VISIBLE_STRING"): "restarts"})
+    with pytest.raises(
+        DriveFaultError, match="node 5 has restarted while its parameters were read"
+    ):
+        back_up("machine", [drive])
 
 
 def test_an_object_that_can_not_be_read_for_another_reason_stops_the_backup():

@@ -106,11 +106,14 @@ class FakeDrive:
 
     def lose_power(self):
         self.ram = dict(self.nvm)
+        self.boots += self.heard
 
     def power_state(self):
         return PowerState.SWITCH_ON_DISABLED
 
-    left_changed = False
+    left_changed, boots = False, 0
+    heard = True
+    """Whether its boot-up message is."""
 
     def answers(self):
         return True
@@ -422,6 +425,48 @@ def test_what_was_stored_counts_only_if_it_was_still_there(number):
         Transaction(world.drives, journal, backup, world.save).write()
     assert world.drives[0].stores >= number
     assert all_hold(world, 0)
+
+
+@pytest.mark.parametrize("heard", [True, False])
+@pytest.mark.parametrize("number", [0, 1])
+def test_a_drive_that_reboots_gets_back_what_was_not_stored_too(number, heard):
+    """Its stored gains are the old ones, or it is written after its boot: nothing else shows it.
+
+    The first drive refuses one value more, so that all are taken back; the second may not be written
+    yet then.
+    """
+    taken_back = 0
+    for at in range(2, 20):
+        refused = {at: Event("power", drive=number), at + 1: Event("refused")}
+        for events in ({at: Event("power", drive=number)}, refused):
+            world, journal, backup = made(2, Storing.NONE, dict(events))
+            for drive in world.drives:
+                drive.nvm[OTHER.address] = 1
+                drive.heard = heard
+            try:
+                Transaction(world.drives, journal, backup, world.save).write()
+            except WriteBackError:
+                taken_back += 1
+                assert [d.ram for d in world.drives] == [values_of(0), values_of(10)], events
+    assert taken_back > 10
+
+
+def test_a_drive_that_reboots_and_then_takes_all_new_values_is_noticed():
+    """It has lost what was not stored; the write is not said to have ended well."""
+    world, journal, backup = made(2, Storing.NONE, {1: Event("power", drive=1)})
+    world.drives[1].nvm[OTHER.address] = 1
+    with pytest.raises(WriteBackError, match=r"axis1: node 2 has restarted .* Nothing was changed"):
+        Transaction(world.drives, journal, backup, world.save).write()
+    assert all_hold(world, 0, nvm=False)
+
+
+@pytest.mark.parametrize("storing", [Storing.NONE, Storing.ALL])
+def test_a_drive_that_booted_before_its_backup_is_written(storing):
+    world, journal, backup = made(2, storing, {})
+    for drive in world.drives:
+        drive.boots = 3
+    Transaction(world.drives, journal, backup, world.save).write()
+    assert all_hold(world, 5, nvm=storing is Storing.ALL)
 
 
 def _refuse_to_store(write):
