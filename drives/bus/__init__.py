@@ -14,7 +14,7 @@ from drives.bus.load import (
     frame_bits,
     shortest_cycle,
 )
-from drives.bus.opening import open_bus
+from drives.bus.opening import close_bus, open_bus
 from drives.bus.trouble import bus_state, trouble_of
 
 __all__ = [
@@ -26,6 +26,7 @@ __all__ = [
     "bus_state",
     "check_cycle",
     "clock_of",
+    "close_bus",
     "drives_begin_anew",
     "frame_bits",
     "not_imitated",

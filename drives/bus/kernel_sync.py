@@ -12,6 +12,8 @@ import struct
 
 import can
 
+from drives.errors import BusError
+
 _TX_SETUP, _TX_DELETE = 1, 2
 _SET_TIMER, _START_TIMER = 0x0001, 0x0002
 _HEAD = struct.Struct("@IIIllllII0q")
@@ -36,6 +38,8 @@ class LeasedSync:
     ------
     can.CanInitializationError
         If this kernel has no broadcast manager, or the interface is not there.
+    BusError
+        By every call later on, if the kernel does not take it any more.
     """
 
     def __init__(self, channel: str, identifier: int = 0x080) -> None:
@@ -76,6 +80,7 @@ class LeasedSync:
         try:
             self._socket.send(command)
         except OSError as error:
-            raise can.CanOperationError(
-                f"the broadcast manager: {error.strerror}", error.errno
+            raise BusError(
+                f"the kernel gives no SYNC any more: {error.strerror}. Is the adapter still plugged in, "
+                "and its interface up?"
             ) from error

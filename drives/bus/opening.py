@@ -57,6 +57,20 @@ def open_bus(profile: BusProfile) -> can.BusABC:
     return opened
 
 
+def close_bus(bus: can.BusABC) -> None:
+    """Close a bus, also one that can not be closed in order any more.
+
+    What an adapter that was pulled out says of that must not take the place of what there is to say of
+    the drives.
+    """
+    try:
+        bus.shutdown()
+    except UserStopError:
+        raise
+    except Exception:  # adapters' libraries raise whatever they like
+        return
+
+
 def _why_not(profile: BusProfile, error: Exception) -> str:
     said = " ".join(str(error).split()) or type(error).__name__
     name = (

@@ -9,7 +9,7 @@ from pathlib import Path
 import can
 
 from drives.api import MotionWatch, Onlooker
-from drives.bus import CyclicLoad, check_cycle, open_bus, shortest_cycle
+from drives.bus import CyclicLoad, check_cycle, close_bus, open_bus, shortest_cycle
 from drives.canopen_drive import fail_safe, setup
 from drives.canopen_drive.drive import CanopenDrive
 from drives.canopen_drive.interrupts import uninterrupted
@@ -364,7 +364,7 @@ def connect(
     with ExitStack() as stack:
         if bus is None:
             bus = open_bus(machine.bus)
-            stack.callback(bus.shutdown)
+            stack.callback(close_bus, bus)
         line = Line(stack.enter_context(traced(bus, trace)))
         stack.callback(_forget_nodes, line)
         drives = [CanopenDrive(line, axis, profiles[axis.name]) for axis in machine.axes]

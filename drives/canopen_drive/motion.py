@@ -13,7 +13,14 @@ import numpy as np
 
 from drives import objects
 from drives.api import Capture, FloatArray, MotionWatch, Onlooker, Source, Targets, joined
-from drives.canopen_drive.channel import INPUT, OUTPUT, Channel, channel_of, couple
+from drives.canopen_drive.channel import (
+    INPUT,
+    MISSING_ALLOWED,
+    OUTPUT,
+    Channel,
+    channel_of,
+    couple,
+)
 from drives.canopen_drive.drive import CanopenDrive
 from drives.canopen_drive.interrupts import uninterrupted
 from drives.canopen_drive.line import Line
@@ -222,6 +229,7 @@ class CanopenMotion:
             self._cycle([self._word(c, _next_word(c.state)) for c in self._channels])
             self._check_user()
             self._check_strangers()
+            self._check_flood()
             if any(c.state is PowerState.OPERATION_ENABLED for c in self._channels):
                 self._look(self._held_targets(), [0] * len(self._channels))
             for channel in self._channels:
@@ -271,8 +279,19 @@ class CanopenMotion:
         ------
         SafetyStopError
             If a drive's PDOs come too late, show another state than the drive has, or it is in
-            another mode than it was set to.
+            another mode than it was set to; or if that can not be asked any more.
         """
+        try:
+            self._look_for_doubt()
+        except StoppedError:
+            raise
+        except DrivesError as error:
+            raise SafetyStopError(
+                f"{error} It was so at the end of a motion, with all axes disabled: what was measured "
+                "in it is kept, but do not rely on it."
+            ) from error
+
+    def _look_for_doubt(self) -> None:
         for channel in self._channels:
             drive = channel.drive
             if channel.contradicts:
@@ -284,13 +303,7 @@ class CanopenMotion:
                     axis=drive.axis,
                 )
             self._check_mode(channel)
-        try:
-            self._check_replies()
-        except DriveFaultError as error:
-            raise SafetyStopError(
-                f"{error} It was so at the end of a motion: what was measured in it is kept, but do not "
-                "rely on it."
-            ) from error
+        self._check_replies()
 
     def _check_mode(self, channel: Channel) -> None:
         wrong = self._wrong_mode(channel)
@@ -540,9 +553,15 @@ class CanopenMotion:
             self._hand_on(message)
 
     def _collect(self, deadline: float) -> bool:
+        """Take every drive's PDO; return whether all came.
+
+        A host that was held up takes what waits for it after the deadline too, but not other frames
+        without end.  None is taken that may be older than the SYNC.
+        """
         by_cob, channels, clock = self._by_cob, self._channels, self._line.clock
         awaited = set(by_cob.values())
-        while awaited:
+        end = clock.now() + self._cycle_time
+        while awaited and not self._sync.behind:
             message = self._line.receive(max(0.0, deadline - clock.now()))
             if message is None:
                 break
@@ -552,8 +571,11 @@ class CanopenMotion:
             elif k in awaited:
                 channels[k].take(bytes(message.data))
                 awaited.discard(k)
+                continue
             else:
                 channels[k].strayed = True
+            if clock.now() >= end:
+                break
         for k in awaited:
             channels[k].missing += 1
         return not awaited and not any(c.strayed for c in channels)
@@ -612,11 +634,22 @@ class CanopenMotion:
                 cycle=self._count - 1,
             )
 
+    def _check_flood(self) -> None:
+        behind = self._sync.behind
+        if len(behind) > MISSING_ALLOWED:
+            raise SafetyStopError(
+                f"frames come faster than this computer takes them, the last one 0x{behind[-1]:X}: for "
+                f"{len(behind)} cycles nothing was known of the drives; all axes were stopped. Look for "
+                "a device that sends without end, close other programs, and start again.",
+                cycle=self._count - 1,
+            )
+
     def _check(self, targets: Sequence[int], offsets: Sequence[int]) -> None:
         """Raise SafetyStopError for the first thing that is not as it has to be."""
         self._check_user()
         self._check_lateness(targets)
         self._check_strangers()
+        self._check_flood()
         self._look(targets, offsets)
         now = self._line.clock.now()
         for channel, target in zip(self._channels, targets, strict=True):

@@ -9,6 +9,7 @@ import can
 from drives.bus.kernel_sync import LeasedSync
 from drives.canopen_drive.line import Line
 from drives.canopen_drive.pace import LATE_SHARE
+from drives.errors import BusError
 
 SYNC_ID = 0x080
 _BEFORE_NOW = 1e-7
@@ -19,6 +20,8 @@ OLDEST = 5.0
 """Seconds that a frame may have waited to be read; more, or less than none: the clock was set."""
 GONE = 1.5
 """Cycles without the kernel's SYNC after which its lease has ended."""
+IN_VAIN = 10
+"""Times that so many cycles are waited for it in one cycle, before it is given up."""
 
 Early = Callable[[can.Message], None]
 """Takes a frame that came before the SYNC."""
@@ -34,6 +37,9 @@ class Sync(Protocol):
     """Largest lateness, s."""
     lateness: float
     """Of the present cycle, s; 0 where it is not late."""
+    behind: list[int]
+    """Of each cycle, in a row until the present one, whose SYNC went out before all earlier frames were
+    taken: the identifier of the last one taken.  What comes next may be old."""
 
     def restart(self) -> None:
         """Begin anew: the next cycle is one cycle time from now."""
@@ -57,13 +63,18 @@ class HostSync:
         self._start, self._count = line.clock.now() + cycle_time, 0
         self.cycles = self.late = 0
         self.worst = self.lateness = 0.0
+        self.behind: list[int] = []
 
     def restart(self) -> None:
         """Begin anew: the next cycle is one cycle time from now."""
         self._start, self._count = self._line.clock.now() + self._cycle_time, 0
 
     def give(self, early: Early) -> float:
-        """Wait for the next cycle's moment, take what came until then, and send a SYNC."""
+        """Wait for the next cycle's moment, take what came until then, and send a SYNC.
+
+        Frames that come faster than they are taken keep it back for a cycle at most; once for as long
+        as the host was held up besides, for many may have come meanwhile.
+        """
         line, clock = self._line, self._line.clock
         moment = self._start + self._count * self._cycle_time
         clock.wait_until(moment - _BEFORE_NOW)
@@ -73,10 +84,19 @@ class HostSync:
         if self.lateness:
             self._start += late
             moment += late
-        while (message := line.receive(0.0)) is not None:
-            early(message)
+        held_up = 0.0 if self.behind else max(0.0, late)
+        self._take_early(early, clock.now() + held_up + self._cycle_time)
         line.send(self._message)
         return moment
+
+    def _take_early(self, early: Early, end: float) -> None:
+        line = self._line
+        while (message := line.receive(0.0)) is not None:
+            early(message)
+            if line.clock.now() >= end:
+                self.behind.append(message.arbitration_id)
+                return
+        self.behind.clear()
 
     def close(self) -> None:
         """Nothing is left to do."""
@@ -112,18 +132,24 @@ class KernelSync(HostSync):
         """Renew the lease, and wait for the SYNC that acts on the targets just sent.
 
         One that came before they were all sent is no SYNC of this cycle: the cycle is late.
+
+        Raises
+        ------
+        BusError
+            If it does not come, however often it is started, or not through all the others.
         """
-        line = self._line
+        line, patience = self._line, GONE * self._cycle_time
         sent, overtaken = line.clock.now(), 0.0
+        in_vain, until = 0, sent + patience
         if self._origin is None:
             self._lease.start(self._period)
         else:
             self._lease.renew(self._period)
-        while True:
-            message = line.receive(GONE * self._cycle_time)
+        while in_vain < IN_VAIN:
+            message = line.receive(patience)
             if message is None:  # the lease had ended: the host was very late
                 self._origin, self._count = None, 0
-                overtaken = max(overtaken, GONE * self._cycle_time)
+                overtaken = max(overtaken, patience)
                 self._lease.start(self._cycle_time)
             elif message.arbitration_id != SYNC_ID or message.is_extended_id:
                 early(message)
@@ -131,9 +157,16 @@ class KernelSync(HostSync):
                 overtaken = max(overtaken, sent - moment)
                 self._count += 1
             else:
-                break
-        self._follow(moment, overtaken)
-        return moment
+                self._follow(moment, overtaken)
+                return moment
+            now = line.clock.now()
+            if message is None or now >= until:  # once, however long the host was held up
+                in_vain, until = in_vain + 1, now + patience
+        raise BusError(
+            f"the kernel's SYNC did not come back within {1000 * (line.clock.now() - sent):.0f} ms: "
+            "what this computer sends does not get onto the bus, or others fill it. Check the cable to "
+            "the drives, look for a device that sends without end, and start again."
+        )
 
     def _moment(self, message: can.Message) -> float:
         """Return when a frame came, by the bus' clock, which nobody sets: the kernel stamps by its

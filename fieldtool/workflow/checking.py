@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from drives.bus import MAX_CYCLIC_LOAD, Bus, CyclicLoad, open_bus, shortest_cycle
+from drives.bus import MAX_CYCLIC_LOAD, Bus, CyclicLoad, close_bus, open_bus, shortest_cycle
 from drives.bus.clock import Clock, WallClock
 from drives.canopen_drive import CanopenDrive
 from drives.canopen_drive.group import profile_of
@@ -143,7 +143,7 @@ class _Check:
         except BusError as error:
             findings.note("bus", "fail", str(error))
         finally:
-            opened.shutdown()
+            close_bus(opened)
         return self._result()
 
     def _result(self) -> CheckResult:

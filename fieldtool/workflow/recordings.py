@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from pathlib import Path
 
-from drives.bus import open_bus
+from drives.bus import close_bus, open_bus
 from drives.errors import BusError, ProfileError
 from drives.profile import MachineProfile, load_machine
 from fieldtool.errors import NotEnoughDataError
@@ -137,5 +137,5 @@ def simulate(
             ),
         )
     finally:
-        bus.shutdown()
+        close_bus(bus)
     return report.sentence

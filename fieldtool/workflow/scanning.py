@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from drives.bus import open_bus
+from drives.bus import close_bus, open_bus
 from drives.profile import BusProfile, DriveProfile, MachineProfile, load_drive, packaged
 from drives.scan import Scan, ScannedNode
 from drives.scan import scan as scan_bus
@@ -95,7 +95,7 @@ def scan(
                     used, bus.bitrate, profiles, listen=listen, ask=ask, progress=progress
                 )
         finally:
-            opened.shutdown()
+            close_bus(opened)
     remarks = () if machine is None else compared_with(machine, found, profiles)
     return ScanResult(bus, found, machine, remarks)
 

@@ -4,8 +4,11 @@ import can
 import numpy as np
 import pytest
 
+from drives.canopen_drive import CanopenMotion
 from drives.errors import BusError, NothingMovedError, SafetyStopError
 from drives.sim.faults import SdoRefused, SdoSilent
+from drives.sim.host_faults import InterfaceDown
+from drives.sim.lockstep_bus import LockstepBus
 from fieldtool.workflow.session import never, open_session
 
 TABLE, ARM = 11, 12
@@ -262,3 +265,127 @@ def test_what_a_motion_left_is_said_when_a_later_step_fails(bench):
     assert bench.changed() == {ARM: {"0x6007:00": (1, 3)}}
     (note,) = refused.value.__notes__
     assert note.startswith("could not be put back: arm, object 0x6007:00: the drive refused")
+
+
+@pytest.fixture
+def closing_fails(monkeypatch):
+    """An adapter's library that complains where the adapter is closed; return how often it did."""
+    shutdown, closed = LockstepBus.shutdown, []
+
+    def failing(bus):
+        shutdown(bus)
+        closed.append(bus)
+        raise can.CanOperationError("Could not write to serial device")
+
+    monkeypatch.setattr(LockstepBus, "shutdown", failing)
+    return closed
+
+
+def test_what_may_be_enabled_is_said_though_the_bus_can_not_be_closed(bench, closing_fails):
+    bench.in_sweep.append((InterfaceDown(), 0))
+    outcome = bench.measure()
+    assert outcome.code == 4, outcome.err
+    assert "Network is down" in outcome.err
+    for sentence in ("table: node 11 does not answer", "arm: node 12 does not answer"):
+        assert sentence in outcome.err
+    assert "MAY STILL BE ENABLED" in outcome.err
+    assert closing_fails
+
+
+@pytest.mark.parametrize("command", ["scan", "check"])
+def test_what_was_found_is_said_though_the_bus_can_not_be_closed(bench, closing_fails, command):
+    outcome = bench.command(command, bench.profile)
+    assert outcome.code == 0, outcome.err
+    assert closing_fails
+
+
+class Flood:
+    """From now on another frame waits whenever the host has taken one, which takes so long."""
+
+    def __init__(self, monkeypatch, each=1e-4):
+        self.begun, self.each, self.recv, self.left = False, each, LockstepBus.recv, 50_000
+        monkeypatch.setattr(LockstepBus, "recv", lambda bus, timeout=None: self(bus, timeout))
+
+    def __call__(self, bus, timeout):
+        if not self.begun:
+            return self.recv(bus, timeout)
+        self.left -= 1
+        assert self.left > 0, "the host takes frames for ever"
+        bus.clock.wait_until(bus.clock.now() + self.each)
+        return can.Message(arbitration_id=0x123, data=bytes(8), is_extended_id=False)
+
+
+def test_frames_without_end_stop_every_axis(bench, monkeypatch):
+    """Nothing is heard of the drives any more, but they hear: quick stop, then off."""
+    flood = Flood(monkeypatch)
+    begun_at = None
+    with (
+        bench.connected() as group,
+        pytest.raises(SafetyStopError, match=r"faster .* 0x123: for 2 cycles") as stop,
+        group.motion(0.002) as motion,
+    ):
+
+        def source(before):
+            nonlocal begun_at
+            if before is not None:
+                flood.begun, begun_at = True, bench.machine.sync_count
+                monkeypatch.setattr(CanopenMotion, "_make_sure_off", off_by_then)
+            return np.tile(motion.position, (50, 1))
+
+        make_sure = CanopenMotion._make_sure_off
+
+        def off_by_then(motion):
+            assert bench.powered() == {}, "before the last resort"
+            assert bench.machine.sync_count - begun_at < 10
+            make_sure(motion)
+
+        motion.stream(source)
+    assert stop.value.capture.rows > 50
+    assert bench.powered() == {}
+    notes = " ".join(stop.value.__notes__)
+    assert notes.count("MAY STILL BE ENABLED") == 2, "nothing of it was heard"
+
+
+def test_frames_of_before_are_not_taken_for_those_of_this_cycle(bench):
+    """What waits behind a flood is old when it comes."""
+    with bench.connected() as group, group.motion(0.002) as motion:
+        motion._line.send(can.Message(arbitration_id=0x080, is_extended_id=False))
+        motion._sync.behind.append(0x123)
+        assert not motion._collect(bench.machine.now + 0.001)
+        assert [channel.missing for channel in motion._channels] == [1, 1]
+        motion._sync.behind.clear()
+        assert motion._collect(bench.machine.now + 0.001)
+        assert [channel.missing for channel in motion._channels] == [0, 0]
+
+
+def test_a_collection_ends_though_frames_go_on(bench, monkeypatch):
+    flood = Flood(monkeypatch)
+    with bench.connected() as group, group.motion(0.002) as motion:
+        flood.begun = True
+        begun = bench.machine.now
+        assert not motion._collect(begun + 0.0018)
+        assert bench.machine.now - begun == pytest.approx(0.002, abs=2e-4)
+        flood.begun = False
+
+
+@pytest.mark.parametrize(
+    ("fault", "said"),
+    [(SdoSilent(ARM, 0x6061), "arm, object 0x6061:00: node 12 did not answer"), (None, "is down")],
+    ids=["one object", "the bus"],
+)
+def test_a_doubt_that_can_not_be_settled_at_the_end_is_a_stop(bench, monkeypatch, fault, said):
+    """Axes have moved: this is no refusal before motion."""
+    check = CanopenMotion._check_mode
+
+    def failing(motion, channel):
+        bench.inject(fault or InterfaceDown())
+        check(motion, channel)
+
+    monkeypatch.setattr(CanopenMotion, "_check_mode", failing)
+    with (
+        bench.connected() as group,
+        pytest.raises(SafetyStopError, match=f"{said}.* with all axes disabled: .* is kept"),
+        group.motion(0.002) as motion,
+    ):
+        motion.stream(held(motion.position, 20))
+    assert bench.powered() == {}

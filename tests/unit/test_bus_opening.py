@@ -5,7 +5,7 @@ import struct
 import can
 import pytest
 
-from drives.bus import opening
+from drives.bus import close_bus, opening
 from drives.bus.adapters import known_options
 from drives.bus.kernel_link import KernelLink, kernel_links, read_link
 from drives.bus.trouble import trouble_of
@@ -175,3 +175,23 @@ def test_a_bus_on_other_hardware_has_other_channels_and_options() -> None:
         "bitrate": 125_000,
         "options": {"device_id": 3},
     }
+
+
+class Unplugged:
+    """An adapter that was pulled out: its library complains where it is closed."""
+
+    closed = False
+
+    def shutdown(self) -> None:
+        self.closed = True
+        raise can.CanOperationError("Could not write to serial device")
+
+
+def test_a_bus_that_can_not_be_closed_hides_no_error() -> None:
+    bus = Unplugged()
+    with pytest.raises(BusError, match="what matters"):
+        try:
+            raise BusError("what matters")
+        finally:
+            close_bus(bus)
+    assert bus.closed

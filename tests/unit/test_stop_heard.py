@@ -6,7 +6,7 @@ from pathlib import Path
 import can
 import pytest
 
-from drives.bus import adapters, opening
+from drives.bus import adapters, close_bus, opening
 from drives.bus.trouble import bus_state
 from drives.canopen_drive import CanopenDrive, connect
 from drives.canopen_drive.line import Line
@@ -201,6 +201,14 @@ def test_a_bus_that_is_opened_is_not_called_broken(monkeypatch):
     monkeypatch.setitem(adapters.BACKENDS, "pressing", (__name__, "Opening"))
     with pytest.raises(UserStopError):
         opening.open_bus(BusProfile(interface="pressing"))
+
+
+def test_a_bus_that_is_closed_is_not_closed_in_silence():
+    class Closing:
+        shutdown = press
+
+    with pytest.raises(UserStopError):
+        close_bus(Closing())
 
 
 def test_an_adapter_s_package_is_not_called_missing(monkeypatch, tmp_path):

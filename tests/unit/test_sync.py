@@ -1,10 +1,17 @@
-"""The kernel's SYNC and the host's clocks: what a time of day that is set may not do."""
+"""SYNC from host and kernel: clocks that are set, SYNCs that do not come, frames that do not end."""
+
+from itertools import pairwise
+from types import SimpleNamespace
 
 import can
 import pytest
 
+from drives.bus import kernel_sync
 from drives.canopen_drive import sync
-from drives.canopen_drive.sync import SYNC_ID, KernelSync
+from drives.canopen_drive.line import Line
+from drives.canopen_drive.sync import GONE, IN_VAIN, SYNC_ID, HostSync, KernelSync
+from drives.errors import BusError
+from tests.unit.scripted_bus import ScriptedBus, frame
 
 CYCLE = 0.01
 
@@ -34,12 +41,15 @@ class Kernel:
 
 class Lease:
     def __init__(self, *_: object) -> None:
-        pass
+        self.starts = 0
 
     def start(self, period: float) -> None:
+        self.starts += 1
+
+    def renew(self, period: float) -> None:
         pass
 
-    renew, stop = start, start
+    stop = renew
 
 
 @pytest.fixture
@@ -79,3 +89,125 @@ def test_a_host_that_comes_late_is_late(kernel):
     cycles(kernel, beat, 1)
     assert beat.lateness == pytest.approx(0.05, abs=CYCLE)
     assert beat.late == 1
+
+
+class Deaf(Kernel):
+    """Nothing comes back of what is sent."""
+
+    def receive(self, timeout: float) -> None:
+        self.asked += 1
+        assert self.asked < 100, "it goes on for ever"
+        self.pass_by(timeout)
+
+
+class Flooded(Kernel):
+    """Somebody fills the bus; a SYNC comes after so many of his frames, and after none if it is None."""
+
+    def __init__(self, before_sync: int | None = None, each: float = 1e-4) -> None:
+        super().__init__()
+        self.before_sync, self.each = before_sync, each
+
+    def receive(self, timeout: float) -> can.Message:
+        self.asked += 1
+        assert self.asked < 5000, "it goes on for ever"
+        self.pass_by(self.each)
+        identifier = SYNC_ID if self.asked - 1 == self.before_sync else 0x18C
+        return can.Message(arbitration_id=identifier, is_extended_id=False, timestamp=self.day)
+
+
+@pytest.fixture
+def beat_on(monkeypatch):
+    """Make the kernel's SYNC on a line."""
+
+    def make(line: Kernel) -> KernelSync:
+        monkeypatch.setattr(sync, "LeasedSync", Lease)
+        monkeypatch.setattr(sync.time, "time", lambda: line.day)
+        return KernelSync(line, CYCLE)
+
+    return make
+
+
+def test_a_sync_that_never_comes_back_is_given_up(beat_on):
+    line = Deaf()
+    beat = beat_on(line)
+    for number in (1, 2):
+        begun = line.now()
+        with pytest.raises(BusError, match=r"did not come back within 150 ms.*Check the cable"):
+            beat.give(lambda _: None)
+        assert line.now() - begun == pytest.approx(IN_VAIN * GONE * CYCLE)
+        assert beat._lease.starts == number * (IN_VAIN + 1), (
+            "and each was tried with its own targets"
+        )
+
+
+def test_a_sync_that_does_not_come_through_a_flood_is_given_up(beat_on):
+    line = Flooded()
+    beat, taken = beat_on(line), []
+    with pytest.raises(BusError, match=r"did not come back .* sends without end"):
+        beat.give(taken.append)
+    assert line.now() - 5.0 == pytest.approx(IN_VAIN * GONE * CYCLE, rel=0.02)
+    assert len(taken) == line.asked, "all were handed on"
+    assert beat._lease.starts == 1, "what waits behind other frames is not sent once more"
+
+
+def test_a_host_that_was_held_up_still_takes_the_sync_that_waits(beat_on):
+    """One pause, however long, is not waiting in vain again and again."""
+    line = Flooded(before_sync=3, each=0.05)
+    beat = beat_on(line)
+    assert beat.give(lambda _: None) == pytest.approx(5.2)
+    assert beat._lease.starts == 1
+
+
+@pytest.mark.parametrize("call", ["start", "renew", "stop"])
+def test_a_broadcast_manager_that_is_gone_is_a_bus_that_is_gone(monkeypatch, call):
+    def refuse(_command: bytes) -> None:
+        raise OSError(19, "No such device")
+
+    opened = SimpleNamespace(connect=lambda _where: None, send=refuse)
+    module = SimpleNamespace(AF_CAN=29, SOCK_DGRAM=2, socket=lambda *_: opened)
+    monkeypatch.setattr(kernel_sync, "socket", module)
+    lease = kernel_sync.LeasedSync("can0")
+    with pytest.raises(BusError, match="no SYNC any more: No such device"):
+        getattr(lease, call)(*([] if call == "stop" else [CYCLE]))
+
+
+class Crowded(ScriptedBus):
+    """A bus on which the next frame waits whenever one was taken, which takes so long."""
+
+    each, left = 1e-5, 10**6
+
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        if not self.left:
+            return super().recv(timeout)
+        self.left -= 1
+        self._time += self.each
+        return frame(0x18C, bytes(8))
+
+
+def test_the_host_s_sync_goes_out_whatever_floods_the_bus():
+    bus = Crowded()
+    beat = HostSync(Line(bus), CYCLE)
+    moments = []
+    for number in range(1, 6):
+        beat.give(lambda _: None)
+        moments.append(bus.now())
+        assert [m.arbitration_id for m in bus.sent] == [SYNC_ID] * number
+        assert beat.behind == [0x18C] * number
+    steps = [b - a for a, b in pairwise(moments)]
+    assert max(steps) < 1.1 * CYCLE
+    bus.left = 5
+    beat.give(lambda _: None)
+    assert beat.behind == [], "all were taken"
+
+
+def test_frames_that_came_while_the_host_was_held_up_are_all_taken():
+    bus = Crowded()
+    beat, taken = HostSync(Line(bus), CYCLE), []
+    bus.wait_until(0.1)
+    bus.left = 5000
+    beat.give(taken.append)
+    assert len(taken) == 5000
+    assert beat.behind == []
+    bus.left = 5000
+    beat.give(taken.append)
+    assert beat.behind, "in other cycles there can not be so many"
