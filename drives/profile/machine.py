@@ -160,7 +160,12 @@ class AxisProfile(Part):
     def _travel(self) -> "AxisProfile":
         low, high = self.limits.travel
         if low >= high:
-            raise ValueError(f"travel must go from low to high, got {low} to {high}")
+            unit = "rad" if self.kind == "rotary" else "m"
+            raise LocatedError(
+                ("limits", "travel"),
+                f"must go from low to high, got {low:.4g} {unit} to {high:.4g} {unit}: write the lower "
+                "position first",
+            )
         move = self.typical_move
         if move is not None:
             for name, wanted, limit in (

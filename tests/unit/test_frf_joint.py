@@ -406,6 +406,99 @@ def test_smooth_peaks_are_no_saturation(good):
             check_saturation(replace(one, torque=torque), 0, "axis1", "N m", slice(None), 2)
 
 
+FLAT = ((1.0,), (1.0, -1 / 9), (1.0, -1 / 6, 1 / 50))
+"""Cosines of one, three and five times a frequency: more derivatives vanish at the crest with each."""
+
+
+def crests(rng):
+    """Torque in N m, flat or sharp at its crests, and its number of periods."""
+    shares = np.array(FLAT[rng.integers(3)])
+    shares[1:] *= rng.uniform(0.95, 1.05, shares.size - 1)
+    samples, periods = int(rng.integers(60, 400)), int(rng.integers(2, 5))
+    angle = 2 * np.pi * (np.arange(samples * periods) / samples + rng.random())
+    wave = sum(share * np.cos((2 * k + 1) * angle) for k, share in enumerate(shares))
+    return rng.lognormal(0, 2) * (wave / np.ptp(wave) + rng.uniform(-1, 1)), periods
+
+
+def coarse(rng, torque):
+    """Round to a step of up to a thousandth of the range, or not at all."""
+    step = rng.choice([0.0, rng.uniform(1e-4, 1e-3)]) * np.ptp(torque)
+    return np.round(torque / step) * step if step else torque
+
+
+def checked(torque, periods):
+    rows, column = np.arange(torque.size) * STEP, torque[:, None]
+    one = Experiment("m1", "multisine", ("axis1",), (), None, rows, 0.0 * column, column)
+    check_saturation(one, 0, "axis1", "N m", slice(None), periods)
+
+
+def test_a_crest_that_several_sines_make_flat_is_no_limit(fresh_rng):
+    for _ in range(60):
+        torque, periods = crests(fresh_rng)
+        noise = fresh_rng.choice([0.0, 1e-4]) * np.ptp(torque)
+        noisy = torque + noise * fresh_rng.normal(size=torque.size)
+        checked(coarse(fresh_rng, noisy), periods)
+
+
+@pytest.mark.parametrize("sides", [(True, True), (True, False), (False, True)])
+def test_a_limit_is_found_whatever_it_cuts_off(sides, fresh_rng):
+    """Under noise before the limit or behind it, and whatever the torque is rounded to."""
+    for _ in range(20):
+        torque, periods = crests(fresh_rng)
+        middle, span = (torque.max() + torque.min()) / 2, np.ptp(torque)
+        cut = fresh_rng.uniform(0.2, 0.35) * span
+        limits = [
+            middle + sign * cut if side else sign * np.inf
+            for side, sign in zip(sides, (-1, 1), strict=True)
+        ]
+        before, behind = fresh_rng.choice([0.0, 1e-4], 2) * span
+        torque = np.clip(torque + before * fresh_rng.normal(size=torque.size), *limits)
+        torque = coarse(fresh_rng, torque + behind * fresh_rng.normal(size=torque.size))
+        with pytest.raises(NotEnoughDataError, match=r"it stays at .* N m .* %"):
+            checked(torque, periods)
+
+
+def test_a_crest_with_ripples_is_no_limit():
+    """Of a joint multisine: within 0.2 % of its range for 10 samples, and steep beside them."""
+    depth = [
+        79.3,
+        66.0,
+        55.0,
+        46.2,
+        39.6,
+        34.9,
+        31.7,
+        29.7,
+        28.5,
+        27.7,
+        26.9,
+        25.9,
+        24.6,
+        22.7,
+        20.5,
+    ]
+    depth += [
+        17.8,
+        14.8,
+        11.9,
+        8.97,
+        6.37,
+        4.17,
+        2.46,
+        1.24,
+        0.49,
+        0.11,
+        0.0,
+        0.03,
+        0.09,
+        0.12,
+        0.11,
+    ]
+    depth += [0.12, 0.31, 0.91, 2.23, 4.62, 8.49, 14.2, 22.1, 32.5, 45.6, 61.3, 79.7, 100, 123, 147]
+    half = 250 - np.array(depth)
+    checked(np.tile(np.concatenate([half, -half]), 2) / 50, 2)
+
+
 def test_axis_that_is_not_excited(good):
     for number in (0, 1):
         reference = good.experiments[number].position_reference.copy()

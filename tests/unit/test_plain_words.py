@@ -37,6 +37,8 @@ PROGRAMMERS = (
         ("node_id: 11", "node_id: eleven", 7, "axis table, node_id: a whole number belongs here"),
         ("kind: rotary", "kind: round", 6, "axis table, kind: has to be rotary or linear"),
         ("travel: [-120 deg, ", "travel: [-120 deg, 0 deg, ", 10, "3 values stand here. A comma ends"),
+        ("[-120 deg, 120 deg]", "[120 deg, -120 deg]", 10, "low to high, got 2.094 rad to -2.094 rad"),
+        ("[-120 deg, 120 deg]", "[1 rev, 1 rev]", 10, "axis table, limits.travel: must go from low"),
         ("[-120 deg, 120 deg]", "120 deg", 10, "position in brackets, such as [-90 deg, 90 deg], got"),
         ("[0.02, 0.025]", "[0,02, 0.025]", 16, "not 0. A comma ends a value: write numbers with a"),
         ("drive: reference", "drive: referenz", 8, "axis table, drive, 'referenz': no such drive pro"),

@@ -23,6 +23,11 @@ _NEAR, _FAR = 0.01, 0.001
 _OVER_ROUNDING = 6.0
 _HELD_SHARE = 0.004
 """Share of the samples at an extreme, from which it is a limit."""
+_CORNER = 2.2
+"""Time that a flank takes on four times the way, over the time it takes at first: 2 from the top of a
+parabola and less from a flatter one, which slow down before; 4 where a straight flank is cut off."""
+_RANDOM = 0.5
+"""Square of the steps over that of the deviations: 2 of white noise, little along a smooth curve."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,11 +156,12 @@ def _stand_out(size: FloatArray, weight: FloatArray, rounding: float) -> NDArray
 def check_saturation(
     experiment: Experiment, axis: int, name: str, unit: str, rows: slice, periods: int
 ) -> None:
-    """Refuse a torque that stays at its extreme.
+    """Refuse a torque that stays at its extreme, where what drives it would go on.
 
     At an extreme of a smooth curve, as many samples lie within a small distance w below the peak as
     lie between w and 4 w; a limit holds many in the first band and few in the second.  It holds at
-    least 4 in a row, at least once in every period.
+    least 4 in a row, at least once in every period: they stand still but for noise and resolution,
+    and the torque arrives or leaves at a speed.  A crest made flat by several sines does not.
 
     Raises
     ------
@@ -176,8 +182,8 @@ def check_saturation(
         depth = float(np.max(sign * torque)) - sign * torque
         top, below = depth <= width, (depth > width) & (depth <= outer)
         count = int(np.count_nonzero(top))
-        often = count > _HELD_SHARE * torque.size and _runs(top, 4) >= periods
-        if often and count > 3 * int(np.count_nonzero(below)):
+        often = count > _HELD_SHARE * torque.size and count > 3 * int(np.count_nonzero(below))
+        if often and _held(depth, width, outer, step) >= periods:
             held.append(f"{sign * float(np.max(sign * torque)):.4g} {unit}")
             total += count
     if held:
@@ -188,7 +194,38 @@ def check_saturation(
         )
 
 
-def _runs(mask: NDArray[np.bool_], shortest: int) -> int:
-    """Count the stretches of at least ``shortest`` samples that are true."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(np.int8), [0]])))
-    return int(np.count_nonzero(edges[1::2] - edges[::2] >= shortest))
+def _held(depth: FloatArray, width: float, outer: float, step: float) -> int:
+    """Count the stretches of 4 samples or more at the top that a limit holds."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], (depth <= width).astype(np.int8), [0]])))
+    levels = (width, outer, outer + 4 * (outer - width))
+    count = 0
+    for start, stop in zip(edges[::2], edges[1::2], strict=True):
+        inner = (stop - start) // 4
+        flanks = depth[start::-1], depth[stop - 1 :]
+        if stop - start >= 4 and _stands_still(depth[start + inner : stop - inner], step):
+            quick = max(1.5, (stop - start) / 10)
+            count += any(_is_corner(flank, levels, quick) for flank in flanks)
+    return count
+
+
+def _stands_still(values: FloatArray, step: float) -> bool:
+    """Whether values differ by no more than their resolution, or by noise."""
+    deviations = float(np.sum((values - values.mean()) ** 2))
+    steps = float(np.sum(np.diff(values) ** 2))
+    return float(np.ptp(values)) < 1.5 * step or steps > _RANDOM * deviations
+
+
+def _is_corner(depth: FloatArray, levels: tuple[float, float, float], quick: float) -> bool:
+    """Whether a flank, from the top outwards, goes on at the speed at which it leaves the top.
+
+    One that is past all levels in less than ``quick`` samples is steep from the first.
+    """
+    passed = []
+    for level in levels:
+        k = int(np.argmax(depth > level))
+        if depth[k] <= level:
+            return False
+        passed.append(k - (depth[k] - level) / (depth[k] - depth[k - 1]))
+    near, middle, far = passed
+    left = int(np.argmax(depth > levels[0]))
+    return bool(far - left < quick or far - middle > _CORNER * (middle - near))
