@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
-from math import exp, isfinite, sqrt
+from math import exp, isnan, sqrt
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ FURTHEST = 2.5
 LEAST_MASS, LEAST_SPRING, LEAST_DAMPER = 0.01, 0.01, 0.1
 """Relative errors that are reckoned with at least: a machine is never the model to a thousandth."""
 UNKNOWN_MASS, UNKNOWN_SPRING, UNKNOWN_DAMPER = 0.05, 0.05, 0.3
-"""Relative errors where the model does not tell."""
+"""Relative errors where the model has none."""
 GAP_SHARE = 0.3
 """Of a spring with backlash: how stiff it is for motions a little larger than the gap."""
 BENT = 0.2
@@ -29,6 +29,7 @@ def samples_of(model: MachineModel, count: int, rng: np.random.Generator) -> lis
     """Return ``count`` models drawn from a model's standard errors.
 
     Errors hang together as the model's correlation says, and are independent where it says nothing.
+    Of a number of infinite error nothing but the order of size is known.
     Masses and springs are drawn in their logarithm, so that none becomes negative; couplings so
     that the mass matrix, with its effects, stays positive definite.
     """
@@ -83,7 +84,7 @@ def _numbers(model: MachineModel, rng: np.random.Generator) -> dict[str, Estimat
     out = {}
     for name, one in numbers.items():
         least, unknown = _floors(name)
-        known = min(one.std / abs(one.value), MOST_KNOWN) if isfinite(one.std) else unknown
+        known = unknown if isnan(one.std) else min(one.std / abs(one.value), MOST_KNOWN)
         besides = sqrt(max(least**2 - known**2, 0.0))
         off = known * normal[name] + besides * _normal(rng)
         factor = 1 + off if name.startswith("coupling") else exp(off)

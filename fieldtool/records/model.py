@@ -11,7 +11,7 @@ N m s/rad on rotary ones.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from math import isfinite, nan
+from math import inf, isfinite, isnan, nan
 from typing import Any, Literal
 
 import numpy as np
@@ -28,7 +28,7 @@ class Estimate:
 
     value: float
     std: float = nan
-    """Standard error, same unit; NaN where it is not known."""
+    """Standard error, same unit; infinite where the data tell nothing, NaN where nobody told it."""
 
 
 @dataclass(frozen=True)
@@ -219,7 +219,7 @@ class MachineModel:
         return matrix
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values in the form of ``model.yaml``; an unknown standard error is null."""
+        """Plain values in the form of ``model.yaml``; an infinite error is null, NaN is left out."""
         return {
             "format": FORMAT,
             "axes": [
@@ -330,15 +330,19 @@ def _friction(axis: AxisModel) -> dict[str, Any]:
 
 
 def _plain(estimate: Estimate) -> dict[str, float | None]:
-    known = bool(np.isfinite(estimate.std))
-    return {"value": float(estimate.value), "std": float(estimate.std) if known else None}
+    value, std = float(estimate.value), float(estimate.std)
+    if isnan(std):
+        return {"value": value}
+    return {"value": value, "std": std if isfinite(std) else None}
 
 
 def _estimate(data: Any) -> Estimate:
     if isinstance(data, Mapping):
         _only_keys(data, {"value", "std", "unit"}, "number")
-        std = data.get("std")
-        return Estimate(_number(data["value"]), nan if std is None else _number(std))
+        value = _number(data["value"])
+        if "std" not in data:
+            return Estimate(value)
+        return Estimate(value, inf if data["std"] is None else _number(data["std"]))
     return Estimate(_number(data))
 
 

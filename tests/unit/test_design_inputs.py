@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from importlib.resources import files
+from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -256,6 +257,7 @@ def doubtful(share: float) -> Callable[[SessionFolder], None]:
             ("on every machine that the model allows", "Keep the present ones, or try --response"),
         ),
         (doubtful(0.4), (), 5, ("table mass 1 is", "is not known", "--time")),
+        (doubtful(inf), (), 5, ("table mass 1 is", "+- inf: that is not known", "--time")),
         (
             lambda folder: lacking(folder, no_velocity_i),
             (),
@@ -276,7 +278,7 @@ def doubtful(share: float) -> Callable[[SessionFolder], None]:
             ("table: its present parameters can not be compared", "parameters-before.yaml"),
         ),
     ],
-    ids=["margin", "unknown", "parameter", "ranges", "unreadable"],
+    ids=["margin", "unknown", "untold", "parameter", "ranges", "unreadable"],
 )  # fmt: skip
 def test_what_stands_against_a_design_is_said_with_what_can_still_be_done(
     tmp_path: Path,

@@ -1,6 +1,6 @@
 """model.yaml survives the disk, and a faulty one is refused with file and line."""
 
-from math import isnan
+from math import inf, isnan
 from pathlib import Path
 
 import numpy as np
@@ -54,6 +54,16 @@ def test_plain_numbers_stand_for_estimates(tmp_path: Path) -> None:
     axis = read_model(path).axes[0]
     assert [mass.value for mass in axis.masses] == [1.0, 2.0]
     assert axis.springs[0].value == 1000.0
+
+
+def test_an_error_that_is_infinite_is_told_from_one_that_is_not_given(tmp_path: Path) -> None:
+    path = tmp_path / "model.yaml"
+    axis = AxisModel("x", "rotary", (Estimate(1.0), Estimate(2.0, inf)), (Estimate(3.0, inf),))
+    write_model(MachineModel((axis,)), path)
+    assert path.read_text().count("std: null") == 2
+    axis = read_model(path).axes[0]
+    assert isnan(axis.masses[0].std)
+    assert (axis.masses[1].std, axis.springs[0].std) == (inf, inf)
 
 
 @pytest.mark.parametrize(
