@@ -10,11 +10,11 @@ from fieldtool.design.tuning_file import tuning_as_dict
 from fieldtool.errors import FieldtoolError, IdentificationError
 from fieldtool.frf.response import load_responses
 from fieldtool.records.model import MachineModel
-from fieldtool.records.model_file import read_model
 from fieldtool.records.session_folder import SessionFolder
 from fieldtool.records.yaml_file import write_yaml
 from fieldtool.report.design_picture import draw_design
 from fieldtool.workflow.design_inputs import drive_sides, moves_of
+from fieldtool.workflow.models import model_of
 
 NOT_KNOWN = 0.3
 """Relative standard error of a mass or spring from which no controller is designed."""
@@ -46,13 +46,14 @@ def redesign(
     Raises
     ------
     FileFormatError
-        If there is no model.
+        If there is no model, or one of another machine.
     DesignError, IdentificationError
         If nothing can be designed; what was kept before is unchanged.
     """
     folder = SessionFolder.existing(folder_path)
     folder.needed(folder.model, "`fieldtool identify` on this folder")
-    machine, model = load_machine(folder.machine), read_model(folder.model)
+    machine = load_machine(folder.machine)
+    model = model_of(machine, folder.model)
     check_known(model)
     tuning = designed(folder, machine, model, response, bound, advance)
     if picture is not None:

@@ -1,15 +1,17 @@
 """Models that a machine profile holds: as last accepted, and, where simulated, as it really is."""
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from drives.errors import ProfileError
 from drives.profile import MachineProfile
-from fieldtool.errors import IdentificationError, PlanRefusedError
+from fieldtool.errors import FileFormatError, IdentificationError, PlanRefusedError
 from fieldtool.experiment.plausible import FAR_OFF
 from fieldtool.records.model import AxisModel, Coupling, Estimate, FloatArray, MachineModel
+from fieldtool.records.model_file import read_model
 from fieldtool.workflow.session import Options
 
 
@@ -36,6 +38,27 @@ def prior_model(machine: MachineProfile) -> MachineModel:
         raise ProfileError(
             machine.path,
             "the couplings together are more than the last masses allow: make them smaller",
+        )
+    return model
+
+
+def model_of(machine: MachineProfile, path: Path) -> MachineModel:
+    """Read a model that has to be one of this machine.
+
+    Raises
+    ------
+    FileFormatError
+        If it is no model, or its axes are not the machine's in name, kind and order.
+    """
+    model = read_model(path)
+    found, needed = (
+        [f"{axis.name} ({axis.kind})" for axis in axes] for axes in (model.axes, machine.axes)
+    )
+    if found != needed:
+        raise FileFormatError(
+            path,
+            f"has the axes {', '.join(found)}, the machine {machine.name} has {', '.join(needed)}: "
+            "give them the same names and kinds in the same order, or identify the machine again.",
         )
     return model
 

@@ -19,7 +19,7 @@ from fieldtool.frf.response import ModelBand, save_responses
 from fieldtool.identify.likelihood.model_band import relative_std
 from fieldtool.identify.recorded import Identified, identify_recording
 from fieldtool.records.model import Estimate, MachineModel
-from fieldtool.records.model_file import read_model, write_model
+from fieldtool.records.model_file import write_model
 from fieldtool.records.recording import load, recorded_seconds
 from fieldtool.records.session_folder import SessionFolder
 from fieldtool.report.pictures import draw_responses
@@ -30,6 +30,7 @@ from fieldtool.workflow.measuring import measured
 from fieldtool.workflow.models import (
     check_believable,
     data_sheet_masses,
+    model_of,
     prior_model,
     simulated_words,
     truth_model,
@@ -252,7 +253,7 @@ def write(
         group,
     ):
         known = folder.model.is_file()
-        model = read_model(folder.model) if known else prior_model(session.machine)
+        model = model_of(session.machine, folder.model) if known else prior_model(session.machine)
         result, _ = written(
             session, group, tuning, options, confirm, model, believed=known, ask_to_move=True
         )

@@ -15,10 +15,10 @@ from drives.sim.faces import face_names
 from fieldtool.errors import FileFormatError, PlanRefusedError
 from fieldtool.frf.velocity_band import white_noise
 from fieldtool.records.model import AxisModel, MachineModel
-from fieldtool.records.model_file import read_model
 from fieldtool.records.recording import Recording, load
 from fieldtool.records.session_folder import SessionFolder
 from fieldtool.records.yaml_file import write_yaml
+from fieldtool.workflow.models import model_of
 from fieldtool.workflow.twin_effects import Rebuilt, rebuilt
 
 OVERLOAD = 3.0
@@ -60,11 +60,7 @@ def twin(folder_path: Path, out: Path | None = None) -> Twin:
     folder = SessionFolder.existing(folder_path)
     machine = _machine(folder)
     folder.needed(folder.model, "`fieldtool identify` on this folder")
-    model, recording = read_model(folder.model), load(folder.recording)
-    if model.names != tuple(a.name for a in machine.axes):
-        raise FileFormatError(
-            folder.model, f"has the axes {', '.join(model.names)}, the machine others."
-        )
+    model, recording = model_of(machine, folder.model), load(folder.recording)
     path = out or folder.path / "twin.yaml"
     data, left_out = _data(folder, machine, model, recording, path)
     write_yaml(path, data)

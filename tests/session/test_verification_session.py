@@ -601,6 +601,19 @@ def test_a_bound_above_the_usual_one_is_said_and_never_stored(session):
     assert session.changed() == {}
 
 
+def test_another_machines_model_foretells_nothing(session):
+    path = session.out / "model.yaml"
+    model = yaml.safe_load(path.read_text())
+    model["axes"].reverse()
+    path.write_text(yaml.safe_dump(model))
+    session.listen()
+    outcome = write(session)
+    assert outcome.code == 2, outcome.err
+    assert "model.yaml: has the axes arm (rotary), table (rotary), the machine" in outcome.err
+    assert not [f for f in session.heard() if f.cob_id == 0x80], "no SYNC: nothing moved"
+    assert session.changed() == {}
+
+
 def test_without_an_identified_model_nothing_is_stored(session):
     (session.out / "model.yaml").unlink()
     session.listen()

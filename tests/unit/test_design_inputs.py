@@ -296,3 +296,47 @@ def test_what_stands_against_a_design_is_said_with_what_can_still_be_done(
     for words in said:
         assert words in text
     assert folder.tuning.is_file() == (code == 0)
+
+
+def crossed(model: dict[str, Any]) -> None:
+    model["axes"].reverse()
+
+
+def lost(model: dict[str, Any]) -> None:
+    del model["axes"][1], model["couplings"]
+    model["effects"] = [one for one in model["effects"] if one["axis"] == "table"]
+
+
+def renamed(model: dict[str, Any]) -> None:
+    model["axes"][0]["name"] = "disk"
+    del model["couplings"], model["effects"]
+
+
+def straight(model: dict[str, Any]) -> None:
+    model["axes"][0]["kind"] = "linear"
+
+
+@pytest.mark.parametrize(
+    ("spoil", "found"),
+    [
+        (crossed, "arm (rotary), table (rotary)"),
+        (lost, "table (rotary)"),
+        (renamed, "disk (rotary), arm (rotary)"),
+        (straight, "table (linear), arm (rotary)"),
+    ],
+)
+def test_no_controller_is_designed_from_another_machines_model(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    spoil: Callable[[dict[str, Any]], None],
+    found: str,
+) -> None:
+    folder = session(tmp_path, ("reference", "reference"))
+    data = yaml.safe_load(folder.model.read_text())
+    spoil(data)
+    folder.model.write_text(yaml.safe_dump(data, sort_keys=False))
+    assert main_code(["design", str(folder.path)]) == 2
+    told = " ".join(capsys.readouterr().err.split())
+    assert f"model.yaml: has the axes {found}, the machine " in told
+    assert " has table (rotary), arm (rotary): " in told
+    assert not folder.tuning.exists()
