@@ -122,6 +122,11 @@ class DriveSide:
         return tuple(k for k in FILTERS if all(self.has(f"filter{k}_{n}") for n in needed))
 
     @property
+    def notches(self) -> bool:
+        """Whether each of those can be a notch; else they are low-passes alone."""
+        return all(self.has(f"filter{k}_zero_damping") for k in self.filters)
+
+    @property
     def missing(self) -> tuple[str, ...]:
         """Gains that a design has and the drive can not be told: for a person to enter."""
         return tuple(name for name in GAINS if not self.has(name))

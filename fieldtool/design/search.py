@@ -250,7 +250,7 @@ def _kinds(best: Best, resonances: FloatArray) -> list[tuple[str, float]]:
     inside = resonances[(resonances > space.lowest) & (resonances < space.highest)]
     corner = min(max(8 * best.servo.loop.velocity_p / space.mass, space.lowest), space.highest)
     kinds = [(LOW_PASS, float(corner))]
-    if inside.size and space.slots.count(NOTCH) < inside.size:
+    if space.side.notches and space.slots.count(NOTCH) < inside.size:
         kinds.append((NOTCH, float(inside[min(space.slots.count(NOTCH), inside.size - 1)])))
     return kinds
 

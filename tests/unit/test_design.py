@@ -10,9 +10,10 @@ import pytest
 import yaml
 from scipy.linalg import solve_continuous_lyapunov
 
+from fieldtool.design.axis_problem import AxisProblem
 from fieldtool.design.decide import design
 from fieldtool.design.design import find
-from fieldtool.design.drive_side import DriveSide, Hold
+from fieldtool.design.drive_side import GAINS, DriveSide, Hold
 from fieldtool.design.loops import Loops, system_matrix
 from fieldtool.design.machine import machine_of, respond
 from fieldtool.design.moves import TestMove
@@ -20,6 +21,7 @@ from fieldtool.design.no_worse import arrival
 from fieldtool.design.predict import frequencies, predict
 from fieldtool.design.robust import check
 from fieldtool.design.rule import DesignError, rule
+from fieldtool.design.search import LOW_PASS, NOTCH, Best
 from fieldtool.design.servo import Servo, Timing
 from fieldtool.design.shaping import NAMES, best_shaper, impulses, vibration_left
 from fieldtool.design.tuning import as_parameters
@@ -171,6 +173,27 @@ def test_filters_of_a_drive_that_can_not_set_them_stay(random_model: RandomModel
     tuning = design(model, [replace(side, tunable=names, present={**side.present, **fixed})])
     assert set(tuning.axes[0].parameters) == names
     assert "low-pass at 180 Hz" in tuning.axes[0].reason
+
+
+@pytest.mark.parametrize(("lacking", "tried"), [("", {LOW_PASS, NOTCH}), ("zero", {LOW_PASS})])
+def test_a_filter_without_a_damping_of_its_zeros_is_no_notch(
+    random_model: RandomModel, monkeypatch: pytest.MonkeyPatch, lacking: str, tried: set[str]
+) -> None:
+    model = random_model(np.random.default_rng(9), (2,))
+    (side,) = sides_of(model)
+    names = {f"filter{k}_{n}" for k in (1, 2)
+             for n in ("type", "frequency", "zero_damping", "pole_damping")}  # fmt: skip
+    if lacking:
+        names = {name for name in names if lacking not in name}
+    seen = set()
+
+    def noted(_problem: AxisProblem, best: Best, _evaluations: int, _spread: float = 0.0) -> Best:
+        seen.update(best.space.slots)
+        return best
+
+    monkeypatch.setattr("fieldtool.design.search.improve", noted)
+    design(model, [replace(side, tunable=frozenset({*GAINS, *names}))], response="soft")
+    assert seen == tried
 
 
 def test_the_three_responses_keep_their_margins(

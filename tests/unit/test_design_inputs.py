@@ -14,6 +14,7 @@ import yaml
 from drives.canopen_drive import connect
 from drives.errors import ProfileError
 from drives.parameters import back_up, planned_changes, read_loop, save_backup
+from drives.parameters.backup import checksum
 from drives.profile import load_machine
 from fieldtool.cli.main import main
 from fieldtool.design.drive_side import GAINS, DriveSide
@@ -167,17 +168,18 @@ def test_moves_and_timing_of_profiles(tmp_path: Path) -> None:
     assert np.isfinite(timing_of(silent).period)
 
 
-def test_a_pid_that_no_cascade_is_can_not_be_compared(tmp_path: Path) -> None:
-    folder = session(tmp_path, ("reference", "epos4"))
-    text = folder.parameters_before.read_text()
-    data = yaml.safe_load(text)
-    for item in data["drives"][1]["objects"]:
-        if item["object"] == "0x30A1:02":
-            item["value"] = 4_000_000_000
-    from drives.parameters.backup import checksum
-
+def held_before(folder: SessionFolder, drive: int, values: dict[str, int]) -> None:
+    """Change what the backup has of a drive, by object."""
+    data = yaml.safe_load(folder.parameters_before.read_text())
+    for item in data["drives"][drive]["objects"]:
+        item["value"] = values.get(item["object"], item["value"])
     data["checksum"] = checksum(data["drives"])
     folder.parameters_before.write_text(yaml.safe_dump(data, sort_keys=False))
+
+
+def test_a_pid_that_no_cascade_is_can_not_be_compared(tmp_path: Path) -> None:
+    folder = session(tmp_path, ("reference", "epos4"))
+    held_before(folder, 1, {"0x30A1:02": 4_000_000_000})
     machine = load_machine(folder.machine)
     side = drive_sides(folder, machine)[1]
     assert side.present is None
@@ -222,6 +224,15 @@ def lacking(folder: SessionFolder, change: Callable[[dict[str, Any]], None]) -> 
 
 def no_velocity_i(parameters: dict[str, Any]) -> None:
     del parameters["velocity_i"]
+
+
+def no_zero_damping(parameters: dict[str, Any]) -> None:
+    for k in (1, 2):
+        del parameters[f"filter{k}_zero_damping"]
+
+
+def no_filter_frequency(parameters: dict[str, Any]) -> None:
+    del parameters["filter1_frequency"]
 
 
 def little_velocity_p(parameters: dict[str, Any]) -> None:
@@ -340,3 +351,35 @@ def test_no_controller_is_designed_from_another_machines_model(
     assert f"model.yaml: has the axes {found}, the machine " in told
     assert " has table (rotary), arm (rotary): " in told
     assert not folder.tuning.exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "kind", "why"),
+    [
+        (no_filter_frequency, 0, ""),
+        (no_filter_frequency, 1, "filter 1 is on, and filter1_frequency can not be read in SI"),
+        (no_zero_damping, 1, "filter 1 is on, and filter1_zero_damping can not be read in SI"),
+        (no_zero_damping, 2, ""),
+        (lambda _: None, 1, ""),
+    ],
+)
+def test_a_filter_that_is_on_and_not_known_is_said(
+    tmp_path: Path, change: Callable[[dict[str, Any]], None], kind: int, why: str
+) -> None:
+    folder = session(tmp_path, ("reference", "reference"))
+    lacking(folder, change)
+    held_before(folder, 0, {"0x2020:01": kind})
+    side = drive_sides(folder, load_machine(folder.machine))[0]
+    assert side.unreadable.startswith(why)
+    assert (side.present_servo is None) == bool(side.unreadable) == bool(why)
+
+
+def test_a_filter_at_no_frequency_that_can_not_be_set_is_said(tmp_path: Path) -> None:
+    folder = session(tmp_path, ("reference", "reference"))
+    lacking(folder, lambda _: None)
+    held_before(folder, 0, {"0x2020:01": 1, "0x2020:02": 0})
+    assert not drive_sides(folder, load_machine(folder.machine))[0].unreadable  # a design sets it
+    own = folder.path / "own.yaml"
+    own.write_text(own.read_text() + "gains_via: read-only\n")
+    tuning = redesign(folder.path, "soft")
+    assert any("filter 1 is on, at 0 Hz, and can not be set" in note for note in tuning.notes)
