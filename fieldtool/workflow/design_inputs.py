@@ -154,9 +154,18 @@ def _kept(folder: SessionFolder, machine: MachineProfile) -> dict[str, _Kept]:
         if axis.encoder_counts_per_rev is not None and not isfinite(counts):
             counts = float(axis.encoder_counts_per_rev)
         if backup is not None and not isfinite(counts):
-            counts = float(_held(backup, ObjectAddress(0x608F, 1)) or nan)
+            counts = _counts_per_rev(profile_of(axis, machine), backup)
         out[axis.name] = _Kept(backup, "" if backup else lacking, rated, counts, step)
     return out
+
+
+def _counts_per_rev(profile: DriveProfile, backup: DriveBackup) -> float:
+    """Return the position units of a motor revolution that a drive held; NaN where it tells none."""
+    scale = profile.position
+    if isinstance(scale, str) or isinstance(scale.counts, str):
+        return nan
+    revolutions = None if scale.revolutions is None else _held(backup, scale.revolutions)
+    return (_held(backup, scale.counts) or nan) / (revolutions or 1)
 
 
 def _held(backup: DriveBackup, address: ObjectAddress) -> float | None:

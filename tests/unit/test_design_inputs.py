@@ -16,6 +16,7 @@ from drives.errors import ProfileError
 from drives.parameters import back_up, planned_changes, read_loop, save_backup
 from drives.parameters.backup import checksum
 from drives.profile import load_machine
+from drives.units import position_factor
 from fieldtool.cli.main import main
 from fieldtool.design.drive_side import GAINS, DriveSide
 from fieldtool.design.rule import DesignError
@@ -171,10 +172,34 @@ def test_moves_and_timing_of_profiles(tmp_path: Path) -> None:
 def held_before(folder: SessionFolder, drive: int, values: dict[str, int]) -> None:
     """Change what the backup has of a drive, by object."""
     data = yaml.safe_load(folder.parameters_before.read_text())
-    for item in data["drives"][drive]["objects"]:
+    items = data["drives"][drive]["objects"]
+    told = {item["object"] for item in items}
+    items += [{"object": one, "type": "UNSIGNED32", "name": "added", "value": 0}
+              for one in values if one not in told]  # fmt: skip
+    for item in items:
         item["value"] = values.get(item["object"], item["value"])
     data["checksum"] = checksum(data["drives"])
     folder.parameters_before.write_text(yaml.safe_dump(data, sort_keys=False))
+
+
+@pytest.mark.parametrize(("counts", "revolutions"), [(2**20, 1), (10 * 2**20, 10), (2**20, 0)])
+def test_the_step_of_a_linear_axis_is_the_drives_own(
+    tmp_path: Path, counts: int, revolutions: int
+) -> None:
+    """Of an encoder that is told for some motor revolutions together, as the drive reckons it."""
+    folder = session(tmp_path, ("reference", "reference"))
+    held_before(folder, 0, {"0x608F:01": counts, "0x608F:02": revolutions})
+    folder.recording.unlink()
+    data = yaml.safe_load(folder.machine.read_text())
+    axis = data["axes"][0] | {"kind": "linear", "feed": 0.4}
+    axis["limits"] |= {"travel": ["-0.3 m", "0.3 m"], "velocity": "1 m/s", "following_error": "0.05 m",
+                       "acceleration": "10 m/s2", "torque": "200 N"}  # fmt: skip
+    axis.pop("encoder_counts_per_rev", None)
+    data["axes"][0] = axis
+    folder.machine.write_text(yaml.safe_dump(data, sort_keys=False))
+    side = drive_sides(folder, load_machine(folder.machine))[0]
+    step = position_factor("linear", counts, revolutions or 1, 0.4)
+    assert side.resolution == pytest.approx(step, rel=1e-12)
 
 
 def test_a_pid_that_no_cascade_is_can_not_be_compared(tmp_path: Path) -> None:
