@@ -82,8 +82,9 @@ def model_numbers(model: MachineModel, torque_units: Sequence[str] = ()) -> tupl
             if value.value != 0.0
         ]
     out += [
-        ModelNumber(" - ".join(c.axes), "coupling", Estimate(c.value, c.std), units[0]["mass"])
+        ModelNumber(" - ".join(c.axes), "coupling", Estimate(c.value, c.std), _coupled(*masses))
         for c in model.couplings
+        for masses in [[units[model.names.index(name)]["mass"] for name in c.axes]]
     ]
     for effect in model.effects:
         axis_name = effect.get("axis")
@@ -101,3 +102,10 @@ def model_numbers(model: MachineModel, torque_units: Sequence[str] = ()) -> tupl
                 )
             )
     return tuple(out)
+
+
+def _coupled(one: str, other: str) -> str:
+    """Return the unit of a coupling of axes with these units of mass; empty where it has none."""
+    if one == other:
+        return one
+    return "kg m" if {one, other} == {"kg", "kg m2"} else ""

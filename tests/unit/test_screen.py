@@ -1,5 +1,6 @@
 """What is shown fits the terminal, loses no digit, and never fails on a name."""
 
+from dataclasses import replace
 from io import StringIO
 from pathlib import Path
 from types import SimpleNamespace
@@ -63,7 +64,16 @@ def test_the_model_with_units_intervals_and_truth() -> None:
     assert "axis1 mass 2 2 not known kg m2 2 +0.00 %" in lines
     assert "axis1 spring 1 1000.5 3.9 N m/rad 1000 +0.05 %" in lines
     assert "slide mass 1 12.5 0.2 kg 12.5 +0.00 %" in lines
-    assert "axis1 - slide coupling -0.25 0.02 kg m2 -0.2 +25.00 %" in lines
+    assert "axis1 - slide coupling -0.25 0.02 kg m -0.2 +25.00 %" in lines
+    both = Coupling(("axis1", "axis2"), 0.1)  # not of the first axis' kind
+    turned = replace(
+        model(),
+        axes=(*reversed(model().axes), replace(model().axes[0], name="axis2")),
+        couplings=(both,),
+    )
+    assert "axis1 - axis2 coupling 0.1 not known kg m2" in " ".join(
+        shown(model_table(turned, None)).split()
+    )
     plain = shown(model_table(model(), None))
     assert "truth" not in plain
     assert "0.71235" in plain
