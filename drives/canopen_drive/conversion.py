@@ -10,7 +10,7 @@ A drive whose position loop is one PID is described by cascade gains all the sam
 which is the cascade with the whole reference velocity fed forward, because D acts on the error.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from math import isfinite, prod, sqrt
 
@@ -175,3 +175,31 @@ def quantity_objects(profile: DriveProfile) -> Iterator[tuple[str, ObjectInfo, f
     for name, quantity in profile.quantities.items():
         if name in needed and not isinstance(quantity.scale, str):
             yield name, ObjectInfo(quantity.object, quantity.type, name), quantity.scale
+
+
+def unmet_conditions(
+    profile: DriveProfile, value_of: Callable[[ObjectInfo], int | None]
+) -> dict[str, str]:
+    """Return the parameters whose unit is not the profile's in this drive: why, in words.
+
+    Parameters
+    ----------
+    profile
+        Of the drive.
+    value_of
+        Returns what the drive holds of an object; None where it has no such object.
+    """
+    out = {}
+    for name, parameter in profile.parameters.items():
+        condition = parameter.only_if
+        if condition is None:
+            continue
+        found = value_of(ObjectInfo(condition.object, condition.type, "condition"))
+        if found == condition.equals or (found is None and condition.missing_is_fine):
+            continue
+        out[name] = (
+            f"its unit is known only while object {condition.object} is {condition.equals} "
+            f"(0x{condition.equals:X}); the drive has {'none' if found is None else found}. Set it, "
+            "or enter the gain with the maker's software."
+        )
+    return out

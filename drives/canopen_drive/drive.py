@@ -13,7 +13,7 @@ from drives import objects
 from drives.api import AxisLimits, DriveIdentity
 from drives.bus import drives_begin_anew
 from drives.canopen_drive.answer import Answer
-from drives.canopen_drive.conversion import Conversion, quantity_objects
+from drives.canopen_drive.conversion import Conversion, quantity_objects, unmet_conditions
 from drives.canopen_drive.line import Line, Node
 from drives.canopen_drive.scaling import Scaled, read_scaling
 from drives.canopen_drive.unseen import Learned
@@ -415,23 +415,9 @@ class CanopenDrive:
             quantities["rated_torque"] = self.scaled.rated_torque
         for name, info, scale in quantity_objects(self.profile):
             quantities[name] = float(self.read(info)) * scale
-        return Conversion(self.axis, self.profile, quantities, dict(self._unmet_conditions()))
-
-    def _unmet_conditions(self) -> Iterator[tuple[str, str]]:
-        for name, parameter in self.profile.parameters.items():
-            condition = parameter.only_if
-            if condition is None:
-                continue
-            info = ObjectInfo(condition.object, condition.type, "condition")
-            found = self.read_optional(info)
-            if found == condition.equals or (found is None and condition.missing_is_fine):
-                continue
-            yield (
-                name,
-                f"its unit is known only while object {condition.object} is {condition.equals} "
-                f"(0x{condition.equals:X}); the drive has {'none' if found is None else found}. Set it, "
-                "or enter the gain with the maker's software.",
-            )
+        return Conversion(
+            self.axis, self.profile, quantities, unmet_conditions(self.profile, self.read_optional)
+        )
 
     def check_limits(self) -> None:
         """Refuse limits that the drive's units can not express: they could not be watched.

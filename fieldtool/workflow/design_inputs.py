@@ -1,6 +1,6 @@
 """What a design needs to know of a machine's drives and axes, from its profile and session folder."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from math import inf, isfinite, nan, pi
 from pathlib import Path
@@ -8,7 +8,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from drives.canopen_drive.conversion import Conversion
+from drives.canopen_drive.conversion import Conversion, unmet_conditions
 from drives.canopen_drive.group import profile_of
 from drives.errors import NotSupportedError, ProfileError
 from drives.objects import ObjectAddress, ObjectInfo
@@ -219,7 +219,18 @@ def _conversion(axis: AxisProfile, profile: DriveProfile, kept: _Kept) -> Conver
         value = None if kept.backup is None else _held(kept.backup, quantity.object)
         if value is not None and quantity.scale != UNKNOWN:
             quantities[name] = value * float(quantity.scale)
-    return Conversion(axis.name, profile, quantities)
+    unmet = {} if kept.backup is None else unmet_conditions(profile, _whole_of(kept.backup))
+    return Conversion(axis.name, profile, quantities, unmet)
+
+
+def _whole_of(backup: DriveBackup) -> Callable[[ObjectInfo], int | None]:
+    """Return what tells an object's value in a backup; None of one that it does not have."""
+
+    def value_of(info: ObjectInfo) -> int | None:
+        value = _held(backup, info.address)
+        return None if value is None else int(value)
+
+    return value_of
 
 
 def _present(
@@ -245,6 +256,7 @@ def _present(
         why = (
             f"{lacking} can not be read in SI units (drive profile {profile.name}); give them as `loop` "
             "at the axis in the machine profile."
+            + "".join(f" {name}: {words}" for name, words in conversion.unmet.items())
         )
         return (values | given if given else None), "" if given else why
     return values, ""

@@ -211,6 +211,24 @@ def test_a_pid_that_no_cascade_is_can_not_be_compared(tmp_path: Path) -> None:
     assert "none that position P and velocity PI could be" in side.unreadable
 
 
+@pytest.mark.parametrize("unit", [0xFA040300, 0x00040300])
+def test_a_gain_of_another_unit_than_the_profiles_is_not_read(tmp_path: Path, unit: int) -> None:
+    folder = session(tmp_path, ("reference", "epos4"))
+    held_before(folder, 1, {"0x30A1:09": unit})
+    side = drive_sides(folder, load_machine(folder.machine))[1]
+    if unit == 0xFA040300:
+        assert side.present is not None
+        assert side.is_pid
+    else:
+        assert side.present is None
+        assert (
+            f"pid_i: its unit is known only while object 0x30A1:09 is {0xFA040300}"
+            in side.unreadable
+        )
+        assert f"the drive has {unit}." in side.unreadable
+        assert "pid_i" not in side.holds
+
+
 def test_parameters_are_designed_for_the_controllers_own_cycle_where_the_profile_has_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
