@@ -15,6 +15,8 @@
         └── NotEnoughDataError   too few lines, too much noise, nothing moved
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 LONGEST = 1000
@@ -23,6 +25,17 @@ LONGEST = 1000
 
 class FieldtoolError(Exception):
     """Root of all that the tool itself refuses; its message is one sentence for a person."""
+
+
+@contextmanager
+def noting(sentence: str) -> Iterator[None]:
+    """Have whatever is raised inside say this besides, if there is anything to say."""
+    try:
+        yield
+    except BaseException as error:
+        if sentence:
+            error.add_note(sentence)
+        raise
 
 
 class FileFormatError(FieldtoolError):

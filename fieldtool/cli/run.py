@@ -30,6 +30,7 @@ from fieldtool.cli.screen import TerminalScreen, show_result
 from fieldtool.cli.stop_key import may_move, stop_key
 from fieldtool.cli.stoppable import StoppableScreen
 from fieldtool.cli.tracing import TraceFile, TraceWanted, trace_path
+from fieldtool.errors import noting
 
 
 def run(
@@ -72,9 +73,10 @@ def run(
             confirm=ask,
             stop_requested=key,
         )
-    show_result(console, result, listed=ask.refused)
-    if as_json:
-        print_json(result.as_dict())
+    with noting("" if result.write_back is None else result.write_back.way_back):
+        show_result(console, result, listed=ask.refused)
+        if as_json:
+            print_json(result.as_dict())
     ask.end()
 
 

@@ -15,6 +15,7 @@ from fieldtool.cli.output import Json, console_of, indented, print_json, written
 from fieldtool.cli.screen import TerminalScreen, show_parameters
 from fieldtool.cli.sheet import Sheet
 from fieldtool.cli.stop_key import stop_key
+from fieldtool.errors import noting
 from fieldtool.workflow.tools import Difference
 from fieldtool.writeback.tool_sets import ToolSet
 
@@ -133,11 +134,12 @@ def switch(
             screen=screen,
             stop_requested=key,
         )
-    show_parameters(console, result, listed=ask.refused)
-    if result.in_memory:
-        console.print(indented(f"`fieldtool restore {result.backup}` takes it back."))
-    if as_json:
-        print_json(written_as_dict(folder, result))
+    with noting(result.way_back):
+        show_parameters(console, result, listed=ask.refused)
+        if result.in_memory:
+            console.print(indented(f"`fieldtool restore {result.backup}` takes it back."))
+        if as_json:
+            print_json(written_as_dict(folder, result))
     ask.end()
 
 

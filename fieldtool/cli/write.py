@@ -15,6 +15,7 @@ from fieldtool.cli.screen import TerminalScreen, show_parameters
 from fieldtool.cli.stop_key import may_move, stop_key
 from fieldtool.cli.stoppable import StoppableScreen
 from fieldtool.cli.tracing import TraceFile, TraceWanted, trace_path
+from fieldtool.errors import noting
 from fieldtool.records.session_folder import SessionFolder
 
 
@@ -41,9 +42,10 @@ def write(
         result = workflow.write(
             folder, options, ask, screen=stoppable, machine=profile, stop_requested=key
         )
-    show_parameters(console, result, listed=ask.refused)
-    if as_json:
-        print_json(written_as_dict(folder, result))
+    with noting(result.way_back):
+        show_parameters(console, result, listed=ask.refused)
+        if as_json:
+            print_json(written_as_dict(folder, result))
     ask.end()
 
 

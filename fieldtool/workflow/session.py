@@ -174,6 +174,8 @@ class Session:
     machine: MachineProfile
     screen: Screen
     warnings: list[str] = field(default_factory=list)
+    write_back: WriteBack | None = None
+    """Of a write that has ended."""
 
     def ready(self) -> bool:
         """Ask whether the machine may move."""
@@ -268,6 +270,8 @@ def open_session(
                 )
     except BaseException as error:
         folder.note("ended", error=type(error).__name__, text=str(error))
+        if session.write_back is not None and session.write_back.way_back:
+            error.add_note(session.write_back.way_back)
         if not keep_profile and folder.recording.is_file():
             error.add_note(
                 f"What was measured is kept in {folder.path}: `fieldtool report {folder.path}` shows it."

@@ -14,7 +14,7 @@ from drives.parameters import Change
 from drives.profile import MachineProfile, load_machine
 from fieldtool.design.tuning import Tuning
 from fieldtool.design.tuning_file import read_tuning
-from fieldtool.errors import FieldtoolError, FileFormatError, NotEnoughDataError
+from fieldtool.errors import FieldtoolError, FileFormatError, NotEnoughDataError, noting
 from fieldtool.frf.response import ModelBand, save_responses
 from fieldtool.identify.likelihood.model_band import relative_std
 from fieldtool.identify.recorded import Identified, identify_recording
@@ -130,8 +130,9 @@ def run(
             with suppress(Exception):  # nothing may hide why it ended
                 report(opened.folder.path)
         raise
-    _reported(session)
-    moving_time = _moving_time(session)
+    with noting(write_back.way_back):
+        _reported(session)
+        moving_time = _moving_time(session)
     return SessionResult(
         session.folder.path,
         identified.model,

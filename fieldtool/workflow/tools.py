@@ -137,6 +137,7 @@ def switch_tool(
             session.screen.say,
             stop_requested=stop_requested,
         )
+        session.write_back = result
         session.folder.note("parameters", rows=parameter_table(result))
         session.folder.note("tool", name=name, written=result.in_memory, stored=result.stored)
         return result

@@ -3,7 +3,8 @@
 from collections.abc import Callable, Sequence
 
 from drives.canopen_drive import CanopenGroup
-from drives.errors import NotSupportedError, ProfileError, UserStopError
+from drives.canopen_drive.interrupts import uninterrupted
+from drives.errors import STOPPED_AT_REST, NotSupportedError, ProfileError, UserStopError
 from drives.parameters import Change, load_journal
 from drives.parameters.journal import State
 from fieldtool.design.tuning import Tuning
@@ -58,6 +59,8 @@ def written(
         If an axis swings with its old parameters; nothing was written.
     WriteBackError, WriteBackMixedError
         As :func:`fieldtool.writeback.transaction.apply`; also if the new parameters fail their trial.
+    UserStopError
+        If the user stopped; where the write had ended, a note says so.
     """
     if not options.write:
         try:
@@ -113,12 +116,17 @@ def written(
         )
     except BaseException as error:
         if verification is not None:
-            verification.ended(error, _held_after(session))
+            with uninterrupted():
+                verification.ended(error, _held_after(session))
         raise
-    if verification is not None:
-        verification.ended(None, State.NEW if result.in_memory else State.OLD)
-    session.folder.note("parameters", rows=parameter_table(result))
-    session.folder.note("write", written=result.in_memory, stored=result.stored)
+    with uninterrupted():  # a stop waits until it stands in the folder what the drives hold
+        session.write_back = result
+        if verification is not None:
+            verification.ended(None, State.NEW if result.in_memory else State.OLD)
+        session.folder.note("parameters", rows=parameter_table(result))
+        session.folder.note("write", written=result.in_memory, stored=result.stored)
+    if result.in_memory and group.stop_requested():
+        raise UserStopError(STOPPED_AT_REST)
     if result.in_memory and verification is None:
         session.warn("The new parameters were not tried on the machine (--no-verify).")
     return result, verification.result if verification else None

@@ -25,6 +25,7 @@ from drives.parameters import (
     load_backup,
     planned_changes,
 )
+from drives.parameters.journal import State
 from drives.parameters.values import same
 from drives.profile import Store
 from fieldtool.design.tuning import Tuning
@@ -60,6 +61,17 @@ class WriteBack:
             "The new parameters are in the drives' working memory only: a power cycle brings the old "
             "ones back. Use --store to keep them."
         )
+
+    @property
+    def way_back(self) -> str:
+        """For whatever goes wrong afterwards: where the new values are, and what takes them out again.
+
+        Empty where nothing was written.
+        """
+        if not self.in_memory or self.backup is None:
+            return ""
+        stored = " --store" if self.stored else ""
+        return f"{self.sentence} `fieldtool restore {self.backup.parent}{stored}` takes them back."
 
 
 def changes_for(drives: Sequence[CanopenDrive], tuning: Tuning) -> tuple[Change, ...]:
@@ -160,13 +172,18 @@ def apply(
     transaction = Transaction(
         drives, journal, backup, keeper, tell, prove, stop_requested, wanted, boots
     )
+    written = tuple(Written(change, change.after) for change in changes)
+    result = WriteBack(written, changes, in_memory=True, stored=keep, backup=backup_path)
     try:
         with keeper:
             transaction.write()
     except OSError as error:
         raise not_kept(keeper, error) from error
-    written = tuple(Written(change, change.after) for change in changes)
-    return WriteBack(written, changes, in_memory=True, stored=keep, backup=backup_path)
+    except BaseException as error:
+        if transaction.journal.state is State.NEW:
+            error.add_note(result.way_back)
+        raise
+    return result
 
 
 def check_agreed(drives: Sequence[CanopenDrive], changes: Sequence[Change], backup: Backup) -> None:

@@ -138,6 +138,35 @@ def test_between_measuring_and_writing(small_bench, monkeypatch, module, name, c
     assert small_bench.recording().experiments[-1].complete, "the data are kept"
 
 
+@pytest.mark.usefixtures("quick_plan", "untried")
+@pytest.mark.parametrize("options", [("--write",), ("--write", "--store"), ()])
+def test_while_the_report_is_made_the_new_parameters_are_not_forgotten(
+    small_bench, monkeypatch, options
+):
+    monkeypatch.setattr(import_module("fieldtool.cli.stop_key"), "ASKED_WITHIN", -1.0)
+    pressing_during(monkeypatch, import_module("fieldtool.workflow.stages"), "report")
+    outcome = small_bench.run("--yes", *options)
+    assert outcome.code == 130, outcome.err
+    said = " ".join(outcome.err.split())
+    way_back = f"fieldtool restore {small_bench.out}{' --store' if '--store' in options else ''}`"
+    assert (way_back in said) == ("--write" in options)
+    assert ("working memory only" in said) == (options == ("--write",))
+    assert ("and stored" in said) == ("--store" in options)
+    assert bool(small_bench.changed()) == ("--write" in options)
+
+
+@pytest.mark.usefixtures("quick_plan", "untried")
+def test_while_the_drives_are_left_after_a_write_the_new_parameters_are_not_forgotten(
+    small_bench, monkeypatch
+):
+    monkeypatch.setattr(import_module("fieldtool.cli.stop_key"), "ASKED_WITHIN", -1.0)
+    pressing_during(monkeypatch, import_module("fieldtool.workflow.session"), "trace_problem")
+    outcome = small_bench.run("--yes", "--write")
+    assert outcome.code == 130, outcome.err
+    assert f"fieldtool restore {small_bench.out}`" in " ".join(outcome.err.split())
+    assert small_bench.changed() != {}
+
+
 def test_a_script_that_asks_for_a_stop_gets_one(bench):
     """The same from Python, without the command line's handler."""
     with pytest.raises(UserStopError):

@@ -14,6 +14,7 @@ import pytest
 import yaml
 
 from drives.canopen_drive.motion import CanopenMotion
+from drives.errors import NotVerifiedError
 from drives.sim.faults import EncoderStuck, Fault, MotorReversed
 from drives.sim.firmware import Parameter
 from fieldtool.errors import PlanRefusedError
@@ -25,6 +26,7 @@ from fieldtool.workflow import verifying
 from fieldtool.workflow.rescued import rescue
 from tests.session.test_trial import Gains
 from tests.tunings import GOOD, begun, scale_model, write_tuning
+from tests.untried import Stood
 
 TABLE, ARM = 11, 12
 VELOCITY_P, VELOCITY_I, POSITION_P = (0x2010, 2), (0x2010, 3), (0x2010, 1)
@@ -506,6 +508,68 @@ def test_ctrl_c_when_the_write_has_ended_leaves_its_verdict(session, monkeypatch
     assert "all drives hold the new values" in outcome.err
     assert "0x2010:02" in session.changed()[TABLE]
     assert verification(session)["verdict"] == "verified"
+
+
+def test_ctrl_c_while_the_verdict_is_kept_loses_nothing(session, monkeypatch):
+    """It ends the command all the same, which says where the new values are and what takes them back."""
+    monkeypatch.setattr("fieldtool.cli.stop_key.ASKED_WITHIN", -1.0)
+    write_yaml = verifying.write_yaml
+
+    def pressed(*arguments):
+        signal.raise_signal(signal.SIGINT)
+        write_yaml(*arguments)
+
+    monkeypatch.setattr(verifying, "write_yaml", pressed)
+    outcome = write(session, "--store")
+    assert outcome.code == 130, outcome.err
+    said = " ".join(outcome.err.split())
+    assert "The new parameters are in the drives and stored" in said
+    assert f"`fieldtool restore {session.out} --store` takes them back" in said
+    assert verification(session)["verdict"] == "verified"
+    assert (session.out / "verification.png").stat().st_size > 0
+    assert session.command("restore", session.out, "--store").code == 0
+    assert session.changed() == {}
+
+
+class Interrupted(Stood):
+    """The user presses Ctrl-C while the verdict is being kept."""
+
+    kept = None
+
+    def ended(self, error, held):
+        signal.raise_signal(signal.SIGINT)
+        Interrupted.kept = type(error).__name__, held.value
+
+
+@pytest.mark.parametrize("late", [False, True])
+def test_ctrl_c_as_the_write_has_ended_waits_for_the_folder(session, monkeypatch, late):
+    """``late``: so long after the last question for it that nothing asks any more."""
+    if late:
+        monkeypatch.setattr("fieldtool.cli.stop_key.ASKED_WITHIN", -1.0)
+    monkeypatch.setattr("fieldtool.workflow.writing.Verification", Interrupted)
+    outcome = write(session)
+    assert outcome.code == 130, outcome.err
+    assert Interrupted.kept == ("NoneType", "new")
+    said = " ".join(outcome.err.split())
+    assert "working memory only" in said
+    assert f"`fieldtool restore {session.out}` takes them back" in said
+    assert '"written": true' in (session.out / "events.jsonl").read_text()
+    assert "0x2010:02" in session.changed()[TABLE]
+
+
+def test_ctrl_c_after_a_failed_trial_does_not_hide_why_it_failed(session, monkeypatch):
+    def failing(_one):
+        raise NotVerifiedError("broken on purpose")
+
+    monkeypatch.setattr("fieldtool.cli.stop_key.ASKED_WITHIN", -1.0)
+    monkeypatch.setattr(Interrupted, "prove", failing)
+    monkeypatch.setattr("fieldtool.workflow.writing.Verification", Interrupted)
+    outcome = write(session)
+    assert outcome.code == 6, outcome.err
+    assert Interrupted.kept == ("WriteBackError", "old")
+    assert "broken on purpose" in outcome.err
+    assert "takes them back" not in outcome.err
+    assert session.changed() == {}
 
 
 def test_a_verdict_is_not_of_values_that_were_written_later_without_a_trial(session):
