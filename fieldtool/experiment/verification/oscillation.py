@@ -11,7 +11,7 @@ swings
     signal has come back by the level.
 growth
     Where swings are to be expected (what rings after a move dies out) they count if they grow, or are
-    far above the level, or do not die out once all references stand.
+    far above the level without dying clearly, or do not die out once all references stand.
 
 An oscillation of frequency f is found some ``(turns + 1) / (2 f)`` after its swing is larger than the
 level, if its turns follow within ``half_period``.  While a reference moves that is shorter than the
@@ -22,6 +22,7 @@ are shares of limits, and grow with the encoder's counts.  What is no number is 
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from math import isfinite
 
 import numpy as np
@@ -44,7 +45,10 @@ LEAPS, FAST = 1.3, 3
 """A swing that is larger by this than the one just before it, in the other direction, leaps, where both
 are so many times faster than they have to be."""
 FAR_ABOVE = 5.0
-"""Times the level: swings of this size count whether they grow or not."""
+"""Times the level: swings of this size count whether they grow or not, unless they die clearly."""
+HALVES = 0.5
+"""Swings die clearly that are each less than so many times the one before: after a push those of a loop
+do whose sensitivity peaks at 2."""
 LASTS, DIES = 7, 0.9
 """At rest a swing has to be smaller than DIES times the one three periods before it."""
 MOST_STEPS = 0.6
@@ -387,7 +391,7 @@ class OscillationWatch:
         slow = int(LONGEST_HALF / self._step) + 1
         if allowed.moving not in (None, k) and swings is self._torques[k]:
             last = swings.series(slow)[-allowed.turns :]
-            return len(last) == allowed.turns and min(last) > FAR_ABOVE * swings.level
+            return len(last) == allowed.turns and self._stays_far_above(last, swings.level)
         if not allowed.settled:
             return False
         series = swings.series(slow, self._since)
@@ -402,7 +406,14 @@ class OscillationWatch:
             return False
         if not allowed.growing or allowed.foreseen == k:
             return True
-        return min(series[-turns:]) > FAR_ABOVE * level or series[-1] > GROWS * min(series[-3::-2])
+        far = self._stays_far_above(series[-turns:], level)
+        return far or series[-1] > GROWS * min(series[-3::-2])
+
+    @staticmethod
+    def _stays_far_above(last: list[float], level: float) -> bool:
+        """Whether swings are far above the level, and not dying clearly."""
+        dying = all(b < HALVES * a for a, b in pairwise(last))
+        return min(last) > FAR_ABOVE * level and not dying
 
     @staticmethod
     def _leaps(series: list[float]) -> bool:
