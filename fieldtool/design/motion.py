@@ -55,6 +55,9 @@ class Moved:
     """Without dry friction."""
     peak_torque: float
     curves: Curves
+    beside: FloatArray
+    """Largest torque, distance and speed of every axis' motor on this move, (3, M): of those whose
+    references stand still; without dry friction, which holds them back."""
 
 
 def moved(
@@ -98,12 +101,15 @@ def moved(
         ways = _dragged_ways(machine, servos, axis, wave, (loops, pushed), ways[0])
     curves = Curves(time, reference, ways[0][0], ways[0][1], ways[0][2], time, stepped)
     band = move.settling_band
+    motors, torques = (wave.signal(one.T) for one in loops.moved(axis, pushed))
+    speeds = np.gradient(motors, time, axis=1)
     return Moved(
         _worst([move_figures(time, reference, way[0], band) for way in ways]),
         _worst([move_figures(time, reference, way[1], band) for way in ways]),
         step_figures(time, stepped, 1.0),
         max(float(np.abs(way[2]).max()) for way in ways),
         curves,
+        np.abs([torques, motors, speeds]).max(axis=2),
     )
 
 

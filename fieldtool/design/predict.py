@@ -52,6 +52,9 @@ class AxisPrediction:
     curves: Curves | None = None
     sensitivity: tuple[FloatArray, FloatArray] | None = None
     """Hz and abs(1 / (1 + L)) of the axis' loop with all others closed, for pictures."""
+    beside: FloatArray | None = None
+    """Largest torque, distance and speed of every axis' motor on this axis' move, (3, M); this one's own
+    say nothing."""
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values without the histories; what is infinite or not known is null."""
@@ -150,6 +153,7 @@ def predict(
                 spreads[k],
                 motion.curves if motion else None,
                 (loops.response.omega / (2 * np.pi), np.abs(loops.sensitivity[:, k])),
+                motion.beside if motion else None,
             )
         )
     peak = sensitivity_peak(loops.input_sensitivity) if steady else inf

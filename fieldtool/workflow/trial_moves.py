@@ -70,26 +70,33 @@ def takes_too_much(
 ) -> tuple[float, str]:
     """Return how many times what is allowed an axis' move takes by these predictions, and of what.
 
-    The limit that it comes nearest to; 1 and no words where all are kept.
+    The limit, its own or one of an axis beside it, that it comes nearest to; 1 and no words where all
+    are kept.
     """
-    limits, rotary = setting.limits[k], setting.model.axes[k].kind == "rotary"
-    length = "rad" if rotary else "m"
     most, words = 1.0, ""
     for prediction in predictions:
         one = prediction.axes[k]
-        if one.curves is None or one.move is None:
+        if one.curves is None or one.move is None or one.beside is None:
             continue
+        taken = (
+            one.beside.T.tolist()
+        )  # an axis whose reference stands still is off it by all its way
         speed = float(np.abs(np.gradient(one.curves.position, one.curves.time)).max())
-        for what, value, limit, unit in (
-            ("torque", one.peak_torque, limits.torque, "N m" if rotary else "N"),
-            ("following error", one.move.following_error, limits.following_error, length),
-            ("velocity", speed, limits.velocity, f"{length}/s"),
-        ):
-            if value > most * KEPT * limit:
-                most = value / (KEPT * limit)
-                words = (
-                    f"{one.axis}: {what} {value:.3g} {unit}, {KEPT * limit:.3g} {unit} is allowed"
-                )
+        taken[k] = [one.peak_torque, one.move.following_error, speed]
+        for own, limits, values in zip(setting.model.axes, setting.limits, taken, strict=True):
+            torque, length = ("N m", "rad") if own.kind == "rotary" else ("N", "m")
+            beside = "" if own.name == one.axis else f" while {one.axis} moves"
+            for what, value, limit, unit in (
+                ("torque", values[0], limits.torque, torque),
+                ("following error", values[1], limits.following_error, length),
+                ("velocity", values[2], limits.velocity, f"{length}/s"),
+            ):
+                if value > most * KEPT * limit:
+                    most = value / (KEPT * limit)
+                    words = (
+                        f"{own.name}: {what} {value:.3g} {unit}{beside}, {KEPT * limit:.3g} {unit} is "
+                        "allowed"
+                    )
     return most, words
 
 

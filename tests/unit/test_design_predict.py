@@ -91,6 +91,14 @@ def test_without_delay_as_the_state_space_in_time(
         assert there == pytest.approx(position[:, k], abs=0.02 * size)
         # the torque's stairs in the one come from its reference's corners
         assert axis.peak_torque == pytest.approx(np.abs(torque[:, k]).max(), rel=0.05)
+        others = np.arange(len(lengths)) != k
+        pushed, way, _ = axis.beside[:, others]
+        slight = 0.01 * axis.peak_torque
+        assert pushed == pytest.approx(np.abs(torque).max(axis=0)[others], rel=0.05, abs=slight)
+        assert way == pytest.approx(np.abs(position).max(axis=0)[others], rel=0.05, abs=0.01 * size)
+        speed = np.abs(np.gradient(position, step, axis=0)).max(axis=0)
+        fastest = 0.01 * speed[k]
+        assert axis.beside[2] == pytest.approx(speed, rel=0.05, abs=fastest)
 
 
 @pytest.mark.parametrize("lengths", [(2,), (1, 2)], ids=str)
