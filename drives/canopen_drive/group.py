@@ -283,9 +283,9 @@ class CanopenGroup:
         if drive.axis in self._unsure:
             drive.left_changed = True
             self._warn(
-                f"{drive.axis}: its fail-safe objects (0x1016, 0x6007, 0x1029) were left armed, and its "
-                "mode and PDOs as they were for the motion, because the drive may still be enabled. "
-                "Switch the drive off and on."
+                f"could not be put back: {drive.axis}: its fail-safe objects (0x1016, 0x6007, 0x1029) "
+                "were left armed, and its mode and PDOs as they were for the motion, because the drive "
+                "may still be enabled. Switch the drive off and on."
             )
             return
         with uninterrupted():

@@ -78,9 +78,8 @@ def takes_too_much(
         one = prediction.axes[k]
         if one.curves is None or one.move is None or one.beside is None:
             continue
-        taken = (
-            one.beside.T.tolist()
-        )  # an axis whose reference stands still is off it by all its way
+        # An axis whose reference stands still is off it by all its way.
+        taken = one.beside.T.tolist()
         speed = float(np.abs(np.gradient(one.curves.position, one.curves.time)).max())
         taken[k] = [one.peak_torque, one.move.following_error, speed]
         for own, limits, values in zip(setting.model.axes, setting.limits, taken, strict=True):

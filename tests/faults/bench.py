@@ -133,8 +133,10 @@ class Bench:
         profile: dict[str, Any] | None = None,
         objects: Mapping[int, Mapping[tuple[int, int], Any]] | None = None,
         factor: float | None = None,
+        moving: int = MOVING_SYNCS,
     ) -> None:
         self.folder, self.moment, self.node = folder, moment, node
+        self._moving_syncs = moving
         self._faults = faults(node)
         self.channel = f"fault-{next(_numbers)}"
         profile = profile or two_axes()
@@ -202,7 +204,7 @@ class Bench:
         self._still += on
         if self.moment is Moment.STILL:
             return self._still >= STILL_SYNCS
-        return on and self._motions >= 2 and self._moving >= MOVING_SYNCS
+        return on and self._motions >= 2 and self._moving >= self._moving_syncs
 
     def _bring_about(self) -> None:
         watch = self.watch

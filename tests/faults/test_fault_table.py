@@ -67,6 +67,17 @@ def test_faults_end_well_at_every_moment(part):
     assert not wrong, "\n".join(wrong)
 
 
+def test_a_motor_that_reverses_is_named_once_the_answer_of_its_axis_is_known():
+    row = next(row for row in ROWS if row.name == "motor reversed")
+    said = []
+    for moving in (300, 400, 500, 600):  # changes of targets: a second of the pilot, and more
+        result = try_case(Moment.SWEEP, row.make, factor=row.factor, moving=moving)
+        assert result.code == 4, result.said
+        assert result.cycles() <= 81
+        said.append(result.said)
+    assert sum("arm: its motor turns against its torque" in text for text in said) >= 3, said
+
+
 def test_the_clairvoyant_is_sooner_than_the_tool_and_sees_nothing_where_nothing_is():
     row = next(row for row in ROWS if row.name == "motor reversed")
     result = try_row(row, Moment.SWEEP)
