@@ -12,8 +12,8 @@ from math import ceil, floor, sqrt
 
 import can
 
-from drives.canopen_drive.answer import Reversed
 from drives.canopen_drive.drive import CanopenDrive
+from drives.canopen_drive.energy import Balance
 from drives.canopen_drive.line import NMT_OPERATIONAL
 from drives.canopen_drive.setup import DRIVE_HEARTBEAT
 from drives.canopen_drive.unseen import FLOOR, Unseen
@@ -23,9 +23,6 @@ from drives.profile import CouplingProfile
 OUTPUT = struct.Struct("<Hih")
 INPUT = struct.Struct("<Hih")
 
-HELD_CYCLES = 20
-"""Cycles in a row with the same target and torque after which an axis counts as held: coupled axes push
-it then, its loop pushes back, and it moves against its own torque as it has to."""
 MISSING_ALLOWED = 1
 """Cycles in a row in which a PDO may be missing."""
 HEARTBEATS_MISSED = 3.5
@@ -72,6 +69,8 @@ class Channel:
     torque: int
     window: int
     """Following error window, position units."""
+    balance: Balance
+    """The energy that its motor has brought in."""
     last: bytes = b""
     statusword: int = 0
     position: int = 0
@@ -125,12 +124,6 @@ class Channel:
     """Acceleration of late, position units per cycle and cycle."""
     places: deque[int] = field(default_factory=lambda: deque(maxlen=2 * SHAKEN_CYCLES + 1))
     """Positions of the last cycles, without a gap."""
-    turned: Reversed | None = None
-    """Looks for a motor that turns against its torque; None for a floating axis."""
-    told: tuple[int, int] = (0, 0)
-    """Target and torque (offset) that were sent last, drive units."""
-    held: int = 0
-    """Cycles in a row in which these were the same."""
 
     @property
     def state(self) -> PowerState | None:
@@ -186,21 +179,16 @@ class Channel:
             self.shaken = max(self.shaken, sure)
 
     def _judge_unseen(self, torque: int, cycles: float) -> None:
-        if self.unseen is None or self.turned is None:
+        enabled = self.statusword & ENABLED_MASK == ENABLED_VALUE
+        friction = self.drive.learned.friction
+        self.balance.take(self.position, torque, cycles, friction, enabled=enabled)
+        if self.unseen is None:
             return
-        if self.statusword & ENABLED_MASK != ENABLED_VALUE:
+        if not enabled:
             self.unseen.restart()
-            self.turned.restart()
-        else:
-            disturbed = sum(other.shaken * torques for other, torques in self.others)
-            self.unseen.take(self.position, torque, cycles, disturbed)
-            before, self.told = self.told, OUTPUT.unpack(self.output.data)[1:]
-            self.held = self.held + 1 if self.told == before else 0
-            if self.held > HELD_CYCLES:
-                self.turned.restart()
-                return
-            friction = self.drive.learned.friction
-            self.turned.take(self.position, torque, cycles, friction)
+            return
+        disturbed = sum(other.shaken * torques for other, torques in self.others)
+        self.unseen.take(self.position, torque, cycles, disturbed)
 
     def _judge_span(self, cycles: float) -> None:
         if self.span_begin is None:
@@ -213,9 +201,7 @@ class Channel:
 
     @property
     def alarm(self) -> str:
-        """What makes it sure that the axis moves unseen, was caught, or is reversed; else empty."""
-        if self.turned is not None and self.turned.alarm:
-            return "reversed"
+        """What makes it sure that the axis moves unseen, or was caught; else empty."""
         return self.unseen.alarm if self.unseen is not None else ""
 
     def is_stuck(self, target: int) -> bool:
@@ -290,8 +276,8 @@ class Channel:
         if abs(torque) > self.torque:
             return (
                 f"{drive.axis}: torque {torque * scale.torque:.4g} {torque_unit} is above the limit "
-                f"{limits.torque:g} {torque_unit}; all axes were stopped. Is the axis blocked, or "
-                "does the prior model have too little inertia?"
+                f"{limits.torque:g} {torque_unit}; all axes were stopped. Is the axis blocked, does "
+                "it move the wrong way, or does the prior model have too little inertia?"
             )
         if not self.free and abs(target - position) > self.window:
             error = (target - position) * scale.position
@@ -299,13 +285,6 @@ class Channel:
                 f"{drive.axis}: following error {error:.4g} {unit} is above the limit "
                 f"{limits.following_error:g} {unit}; all axes were stopped. Does the axis move the "
                 "wrong way, or is it blocked?"
-            )
-        if self.turned is not None and self.turned.alarm:
-            return (
-                f"{drive.axis}: its motor turns against its torque, as it did not before "
-                f"({torque * scale.torque:.3g} {torque_unit} told now); its power was cut and all axes "
-                "were stopped. Check the motor's phases and the encoder's direction: a wire or a "
-                "setting of the drive has changed in motion."
             )
         if self.unseen is not None and self.alarm:
             return self._unseen_words(self.unseen)
@@ -349,6 +328,16 @@ class Channel:
             f"does not count (cable, supply), and it has moved by about {way} unseen, or its brake, a "
             "stop or friction holds it. Both look the same from here: turn it by hand with the power "
             "off, and see whether its position changes."
+        )
+
+    def reversed_words(self) -> str:
+        """Return that its motor is reversed, in a sentence."""
+        drive, torque = self.drive, INPUT.unpack(self.last)[2] * self.drive.scaling.torque
+        return (
+            f"{drive.axis}: moves the wrong way: the axes give back more energy than they were given, "
+            f"so its motor turns against its torque (now {torque:.3g} {drive.torque_unit}), or "
+            "something moves it; its power was cut and all axes were stopped. If nothing touched it, "
+            "check the motor's phases and the encoder's direction."
         )
 
     def trouble(self) -> str:
@@ -398,9 +387,14 @@ def channel_of(
         unseen=None
         if free
         else Unseen(drive.learned, push, window, floor_torque, cycle_time, wind_up),
-        turned=None
-        if free
-        else Reversed(drive.answer, push, limits.torque / scale.torque, cycle_time),
+        balance=Balance(
+            scale.position,
+            scale.torque,
+            limits.torque,
+            sum(drive.axis_profile.prior.masses),
+            cycle_time,
+            drive.learned.pull * scale.torque,
+        ),
     )
 
 

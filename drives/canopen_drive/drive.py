@@ -12,7 +12,6 @@ from canopen.sdo import SdoAbortedError, SdoCommunicationError
 from drives import objects
 from drives.api import AxisLimits, DriveIdentity
 from drives.bus import drives_begin_anew
-from drives.canopen_drive.answer import Answer
 from drives.canopen_drive.conversion import Conversion, quantity_objects, unmet_conditions
 from drives.canopen_drive.line import Line, Node
 from drives.canopen_drive.scaling import Scaled, read_scaling
@@ -66,8 +65,6 @@ class CanopenDrive:
         line.subscribe(0x700 + self.node_id, self._on_heartbeat)
         self.learned = Learned()
         """What its motion has shown so far; learned while it moves."""
-        self.answer = Answer()
-        """How it has answered its torques so far; learned while it moves."""
 
     @property
     def axis(self) -> str:

@@ -22,6 +22,7 @@ from drives.canopen_drive.channel import (
     couple,
 )
 from drives.canopen_drive.drive import CanopenDrive
+from drives.canopen_drive.energy import reversed_axis
 from drives.canopen_drive.interrupts import uninterrupted
 from drives.canopen_drive.line import Line
 from drives.canopen_drive.outputs import Outputs, outputs_of
@@ -660,6 +661,19 @@ class CanopenMotion:
                     cycle=self._count - 1,
                     runaway=channel.is_stuck(target) or bool(channel.alarm),
                 )
+        self._check_energy()
+
+    def _check_energy(self) -> None:
+        """Raise SafetyStopError where the axes give back more energy than they were given."""
+        worst = reversed_axis([c.balance for c in self._channels])
+        if worst is not None:
+            channel = self._channels[worst]
+            raise SafetyStopError(
+                channel.reversed_words(),
+                axis=channel.drive.axis,
+                cycle=self._count - 1,
+                runaway=True,
+            )
 
     def _look(self, targets: Sequence[int], offsets: Sequence[int]) -> None:
         """Have the watch look at this cycle; raise OscillationError if it says that this has to end.

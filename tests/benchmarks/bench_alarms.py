@@ -1,20 +1,24 @@
-"""Sound machines of all kinds are measured: does what watches for encoders and motors stay quiet?
+"""Do the watches for encoders and motors stay quiet on sound machines, and when do they see a fault?
 
-Random machines of two coupled axes: dry friction up to a fifth of the torque limit (Coulomb, Stribeck),
-backlash, encoders of 2000 to 8 million counts a turn, soft and stiff springs, slow and fast loops, noisy
-torques, prior masses wrong by up to a factor of two, slow and fast buses; on half of the axes one thing
-more: weights, magnets that cog, parts that hang on springs, what shakes the machine, delays, encoder
-errors.  Each is measured by the fast plan on the lock-step bus, as a user would.  Of every second
-machine the watch does not get 4 % of the samples, as on a bus that loses cycles.
+Random machines of two kinds.  Two coupled axes: dry friction up to a fifth of the torque limit (Coulomb,
+Stribeck), backlash, encoders of 2000 to 8 million counts a turn, soft and stiff springs, slow and fast
+loops, noisy torques, prior masses wrong by up to a factor of two, slow and fast buses; on half of the
+axes one thing more: weights, magnets that cog, parts that hang on springs, what shakes the machine,
+delays, encoder errors.  And every third one of ``bench_retune``: one to three coupled axes of one to
+three masses.  Each is measured by the fast plan on the lock-step bus, as a user would.  Of every second
+machine the watches do not get 4 % of the samples, as on a bus that loses cycles.
 
 A false alarm is exit code 4, but for a torque above its limit, which is true where it is said.
-``dead``, ``pushed`` and ``reversed`` are the worst shares of the watches' bounds that sound axes came
-to: 1 is an alarm.  Loops are stiff enough
-to move their axis against its friction, as a drive that was set up once is.
+``dead``, ``pushed`` and ``energy`` are the worst shares of the watches' bounds that sound axes came
+to: 1 is an alarm.  Loops are stiff enough to move their axis against its friction, as a drive that was
+set up once is.
 
-Target: no false alarm.
+Each machine that is sound is then measured again, with a motor that is reversed at a drawn moment of
+the measurement: what stops it, after how many cycles, and after how far.
 
-Run: python tests/benchmarks/bench_alarms.py [--seed S] [--machines N]
+Target: no false alarm; every reversed motor stopped.
+
+Run: python tests/benchmarks/bench_alarms.py [--seed S] [--machines N] [--reversals N]
 """
 
 import argparse
@@ -22,20 +26,29 @@ import os
 import sys
 import tempfile
 import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
+import bench_retune
 import numpy as np
 import yaml
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-from drives.canopen_drive.answer import DECIDES, TOLD, Reversed
+from drives.canopen_drive.channel import Channel
+from drives.canopen_drive.energy import Balance
+from drives.canopen_drive.motion import CanopenMotion
 from drives.canopen_drive.unseen import STOOD, Unseen
 from drives.profile import load_machine
+from drives.sim.faults import MotorReversed
 from drives.sim.lockstep_bus import register, unregister
 from drives.sim.machine import simulated_machine
+from drives.sim.running import RunningMachine
+from drives.sim.state_machine import State
 from tests.faults.bench import command
 from tests.session.conftest import two_axes
 
@@ -47,7 +60,7 @@ SAG = 0.003
 """rad by which a weight may pull an axis down before its loop holds it."""
 LOST = 0.04
 """Share of the samples that the watch does not get, of every second machine."""
-worst = {"dead": 0.0, "pushed": 0.0, "reversed": 0.0}
+worst = {"dead": 0.0, "pushed": 0.0, "energy": 0.0}
 
 
 def _one_thing_more(rng: np.random.Generator) -> dict[str, Any]:
@@ -143,24 +156,37 @@ def random_machine(rng: np.random.Generator) -> tuple[dict[str, Any], str]:
     return profile, "; ".join(said)
 
 
+def drawn_machine(rng: np.random.Generator, number: int) -> tuple[dict[str, Any], str]:
+    """Return a machine profile of the kind that this number has, and what is special of it."""
+    if number % 3 < 2:
+        return random_machine(rng)
+    profile = bench_retune.random_machine(rng)
+    with tempfile.TemporaryDirectory() as name:
+        bench_retune.with_old_gains(profile, Path(name))
+    masses = [len(axis["masses"]) for axis in profile["simulation"]["axes"]]
+    return profile, f"new tooling, axes of {masses} masses"
+
+
 def main() -> int:
-    """Measure them; return 1 if the watch stopped one that is sound."""
+    """Measure them; return 1 if a watch stopped one that is sound, or none stopped a reversed motor."""
     options = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     options.add_argument("--seed", type=int)
     options.add_argument("--machines", type=int, default=24)
+    options.add_argument("--reversals", type=int, default=1, help="of each machine")
     given = options.parse_args()
     seed = given.seed
     if seed is None:
         seed = int(np.random.SeedSequence().generate_state(1)[0])
     print(f"seed {seed}, {given.machines} machines", flush=True)
-    loses = _note_shares(np.random.default_rng([seed, given.machines]))
+    bench = Bench(np.random.default_rng([seed, given.machines]))
     began, false, most, codes = time.process_time(), 0, [0.0, 0.0, 0.0], []
+    stops: list[Stop] = []
     for k in range(given.machines):
-        profile, said = random_machine(np.random.default_rng([seed, k]))
-        worst.update(dead=0.0, pushed=0.0, reversed=0.0)
-        loses[0] = LOST * (k % 2)
+        profile, said = drawn_machine(np.random.default_rng([seed, k]), k)
+        worst.update(dead=0.0, pushed=0.0, energy=-1.0)
+        bench.loses = LOST * (k % 2)
         said += ", cycles lost" * (k % 2)
-        code, text = _measured(profile, f"sound-{k}")
+        code, text = bench.measured(profile)
         alarm = code == 4 and "is above the limit" not in text
         false += alarm
         codes.append(code)
@@ -169,56 +195,175 @@ def main() -> int:
         print(f"{k:3} code {code}  {shares}  {said}{'  FALSE ALARM' if alarm else ''}", flush=True)
         if code:
             print(f"      {text[:300]}", flush=True)
+            continue
+        samples, rng = bench.samples, np.random.default_rng([seed, k, 1])
+        for _ in range(given.reversals):
+            node = int(rng.choice([axis["node_id"] for axis in profile["axes"]]))
+            stop = bench.reversed(profile, node, int(rng.integers(1, samples)))
+            stops.append(stop)
+            print(f"      {stop}", flush=True)
     print(
         f"{given.machines} sound machines, {false} false alarms, {codes.count(0)} measured to the end; "
-        f"worst share of the bounds: dead {most[0]:.2f}, pushed {most[1]:.2f}, reversed {most[2]:.2f}; "
-        f"{time.process_time() - began:.0f} s of CPU"
+        f"worst share of the bounds: dead {most[0]:.2f}, pushed {most[1]:.2f}, energy {most[2]:.2f}"
     )
-    return int(false > 0 or 1 in codes)
+    for name in ("its energy", "another watch or limit", "NOTHING"):
+        of_these = [stop for stop in stops if stop.stopped_by == name]
+        if of_these:
+            cycles = sorted(stop.cycles for stop in of_these)
+            ways = sorted(stop.way for stop in of_these)
+            print(
+                f"{len(of_these)} of {len(stops)} reversed motors stopped by {name}, after "
+                f"{np.median(cycles):.0f} cycles (at most {cycles[-1]:.0f}), {np.median(ways):.2g} rad "
+                f"(at most {ways[-1]:.2g})"
+            )
+    print(f"{time.process_time() - began:.0f} s of CPU")
+    return int(false > 0 or 1 in codes or any(stop.stopped_by == "NOTHING" for stop in stops))
 
 
-def _note_shares(rng: np.random.Generator) -> list[float]:
-    """Note how near the watch comes to its bounds; return the share of samples it loses, to be set."""
-    take, loses, lost = Unseen.take, [0.0], dict[int, float]()
+@dataclass(frozen=True)
+class Stop:
+    """What stopped a motor that was reversed."""
 
-    def noted(
-        self: Unseen, position: int, torque: int, cycles: float = 1.0, disturbed: float = 0.0
-    ) -> None:
-        cycles += lost.pop(id(self), 0.0)
-        if rng.random() < loses[0]:
-            lost[id(self)] = cycles
-            return
-        take(self, position, torque, cycles, disturbed)
-        if self._coasting and self._stood >= STOOD:
-            worst["dead"] = max(worst["dead"], abs(self.way) / self.dead)
-        elif not self._coasting and self.knows:
-            worst["pushed"] = max(worst["pushed"], abs(self.way) / self.at_rest)
+    stopped_by: str
+    cycles: float
+    """While its drive was enabled after it."""
+    way: float
+    """rad from where it was, at most, in these."""
+    said: str
 
-    taken = Reversed.take
-
-    def noted_too(self: Reversed, *sample: Any) -> None:
-        taken(self, *sample)
-        told = TOLD * self._of_sound / max(self._of_reversed, 1e-9)
-        worst["reversed"] = max(worst["reversed"], min(self.total / DECIDES, told))
-
-    Unseen.take = noted  # type: ignore[method-assign]
-    Reversed.take = noted_too  # type: ignore[method-assign]
-    return loses
+    def __str__(self) -> str:
+        return (
+            f"reversed: stopped by {self.stopped_by} after {self.cycles:.0f} cycles and {self.way:.3f} "
+            f"rad: {self.said[:110]}"
+        )
 
 
-def _measured(profile: dict[str, Any], channel: str) -> tuple[int, str]:
-    with (
-        tempfile.TemporaryDirectory() as name,
-        patch.dict(os.environ, {"FIELDTOOL_STATE_DIR": str(Path(name) / "notes")}),
-    ):
-        path = Path(name) / "machine.yaml"
-        profile["bus"]["channel"] = channel
-        path.write_text(yaml.safe_dump(profile, sort_keys=False), encoding="utf-8")
-        register(channel, simulated_machine(load_machine(path)))
-        try:
-            return command("measure", path, "--yes", "--time", 20, "--out", Path(name) / "session")
-        finally:
-            unregister(channel)
+class Bench:
+    """Simulated machines behind the command line, and how near the watches come to their bounds.
+
+    ``loses`` is the share of the samples that watches do not get.
+    """
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        self.loses = 0.0
+        self.samples = 0
+        """That channels took in the last measurement."""
+        self._rng, self._lost = rng, dict[int, float]()
+        self._seen: Callable[[], None] = lambda: None
+        self._watch_unseen()
+        self._watch_energy()
+
+    def _loses(self, watch: object, cycles: float) -> float | None:
+        """Return the cycles since a watch's last sample; None where it does not get this one."""
+        cycles += self._lost.pop(id(watch), 0.0)
+        if self._rng.random() < self.loses:
+            self._lost[id(watch)] = cycles
+            return None
+        return cycles
+
+    def _watch_unseen(self) -> None:
+        take = Unseen.take
+
+        def noted(
+            watch: Unseen, position: int, torque: int, cycles: float = 1.0, disturbed: float = 0.0
+        ) -> None:
+            since = self._loses(watch, cycles)
+            if since is None:
+                return
+            take(watch, position, torque, since, disturbed)
+            if watch._coasting and watch._stood >= STOOD:
+                worst["dead"] = max(worst["dead"], abs(watch.way) / watch.dead)
+            elif not watch._coasting and watch.knows:
+                worst["pushed"] = max(worst["pushed"], abs(watch.way) / watch.at_rest)
+
+        Unseen.take = noted  # type: ignore[method-assign]
+
+    def _watch_energy(self) -> None:
+        take, take_all, check = Balance.take, Channel.take, CanopenMotion._check_energy
+
+        def noted(
+            watch: Balance, position: int, torque: int, cycles: float, friction: float, **more: bool
+        ) -> None:
+            since = self._loses(watch, cycles)
+            if since is not None:
+                take(watch, position, torque, since, friction, **more)
+
+        def counted(channel: Channel, data: bytes) -> None:
+            self.samples += 1
+            self._seen()
+            take_all(channel, data)
+
+        def checked(motion: CanopenMotion) -> None:
+            balances = [channel.balance for channel in motion._channels]
+            missing = -sum(one.brought + one.stored for one in balances)
+            spare = min(balances, key=lambda one: one.lately).spare
+            worst["energy"] = max(worst["energy"], missing / spare)
+            check(motion)
+
+        Balance.take = noted  # type: ignore[method-assign]
+        Channel.take = counted  # type: ignore[method-assign]
+        CanopenMotion._check_energy = checked  # type: ignore[method-assign]
+
+    def measured(self, profile: dict[str, Any], node: int = 0, at: int = 0) -> tuple[int, str]:
+        """Measure a machine; reverse a motor at a sample of this number, if a node is given."""
+        seconds = "20"
+        while True:
+            self.samples = 0
+            self.after = self.way = 0.0
+            code, text = self._command(profile, seconds, node, at)
+            asked = bench_retune.MORE.search(text)
+            if code != 3 or asked is None or asked[1] == seconds:
+                return code, text
+            seconds = asked[1]
+
+    def _command(
+        self, profile: dict[str, Any], seconds: str, node: int, at: int
+    ) -> tuple[int, str]:
+        channel = f"alarms-{next(_numbers)}"
+        with (
+            tempfile.TemporaryDirectory() as name,
+            patch.dict(os.environ, {"FIELDTOOL_STATE_DIR": str(Path(name) / "notes")}),
+        ):
+            path = Path(name) / "machine.yaml"
+            profile["bus"]["channel"] = channel
+            path.write_text(yaml.safe_dump(profile, sort_keys=False), encoding="utf-8")
+            machine = register(channel, simulated_machine(load_machine(path)))
+            if node:
+                self._seen = self._reverse(machine, node, at)
+            try:
+                return command(
+                    "measure", path, "--yes", "--time", seconds, "--out", Path(name) / "session"
+                )
+            finally:
+                self._seen = lambda: None
+                unregister(channel)
+
+    def _reverse(self, machine: RunningMachine, node: int, at: int) -> Callable[[], None]:
+        """Return what reverses a motor at a sample, and follows it as long as its drive is enabled."""
+        begun: list[tuple[float, float]] = []
+
+        def seen() -> None:
+            drive = machine.node(node)
+            place = float(machine.axes.state[machine.axes.plant.motors[drive.axis]])
+            if self.samples == at:
+                begun.append((machine.now, place))
+                machine.inject(MotorReversed(node))
+            if begun and drive.motion.state is State.OPERATION_ENABLED:
+                self.after = (machine.now - begun[0][0]) * 1e9 / machine.period
+                self.way = max(self.way, abs(place - begun[0][1]))
+
+        return seen
+
+    def reversed(self, profile: dict[str, Any], node: int, at: int) -> Stop:
+        """Measure a machine of which a motor is reversed on the way."""
+        code, text = self.measured(profile, node, at)
+        by = (
+            "its energy" if "more energy than they were given" in text else "another watch or limit"
+        )
+        return Stop(by if code == 4 else "NOTHING", self.after, self.way, text)
+
+
+_numbers = count()
 
 
 if __name__ == "__main__":

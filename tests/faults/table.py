@@ -476,13 +476,7 @@ ROWS: tuple[Row, ...] = (
         _one(MotorReversed),
         stopped("arm: .*the wrong way", farthest=FAR),
         stopped("arm: .*the wrong way", cycles=300, farthest=FAR),
-        # So early the arm's answer may not be known: then its limits stop it, and it runs on.
-        stopped(
-            "arm: (its motor turns against its torque|torque .* is above the limit|.*speed|.*following)",
-            cycles=81,
-            unseen=0.2,
-            farthest=10.0,
-        ),
+        stopped("arm: .*its motor turns against its torque", cycles=60, unseen=0.12, farthest=10.0),
         NOT_IN_USE,
         factor=-1.0,
     ),

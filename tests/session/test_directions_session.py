@@ -6,8 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from drives.canopen_drive.answer import Answer, Reversed
-from drives.canopen_drive.channel import INPUT, OUTPUT, channel_of
+from drives.canopen_drive.channel import INPUT, channel_of
 from drives.errors import SafetyStopError
 from fieldtool.experiment.axes import Axes
 from fieldtool.experiment.directions import check_directions
@@ -69,25 +68,3 @@ def test_a_stuck_encoder_is_found_as_soon_as_its_counts_allow(
     assert row * CYCLE <= longest
     if counts < 10_000:
         assert row * CYCLE > 0.03
-
-
-@pytest.mark.parametrize("moved", ["target", "torque", "nothing"])
-def test_an_axis_that_is_held_is_not_judged_by_what_others_do_to_it(
-    make_bench, profile_of_two, moved
-):
-    """It moves against the torque of its loop as it has to: no motor is reversed by that."""
-    bench = make_bench(profile_of_two)
-    told = []
-
-    class Told(Reversed):
-        def take(self, position, *_, **__):
-            told.append(position)
-
-    with bench.connected() as group:
-        channel = channel_of(group.drives[0], CYCLE, False)
-    channel.turned = Told(Answer(), 0.1, 1000.0, CYCLE)
-    for k in range(200):
-        target, torque = (k if moved == "target" else 7), (k if moved == "torque" else 0)
-        channel.output.data = OUTPUT.pack(0x0F, target, torque)
-        channel.take(INPUT.pack(0x1237, k % 5, -(k % 5)))
-    assert len(told) == 200 if moved != "nothing" else len(told) < 50

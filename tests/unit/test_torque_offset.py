@@ -9,7 +9,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drives.api import AxisLimits, Capture, Targets, joined
-from drives.canopen_drive.answer import Answer
 from drives.canopen_drive.channel import channel_of
 from drives.canopen_drive.outputs import OUTPUT_ROW, outputs_of
 from drives.canopen_drive.unseen import Learned
@@ -29,7 +28,6 @@ class FakeDrive:
     position_unit: str = "rad"
     torque_unit: str = "N m"
     learned: Learned = field(default_factory=Learned)
-    answer: Answer = field(default_factory=Answer)
 
     @property
     def axis_profile(self):

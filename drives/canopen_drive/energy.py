@@ -1,0 +1,117 @@
+"""A motor that turns against its torque: told in motion from the energy of the whole machine.
+
+Masses, springs, dampers and friction give back at most the energy that they were given, and couplings
+pass it on: whatever a machine of these is like, the work of all its motors never falls below what it
+held in the beginning (passivity; Willems 1972, Arch. Rational Mech. Anal. 45, 321).  A motor that turns
+against its torque does the opposite of the work that its drive tells, so that the sum falls without
+bound as it moves.  Nothing has to be known of masses, springs, or loops for that.
+
+The work is told from positions and torques, one sample of each a cycle, and errs: every axis' balance
+counts in the machine's favour what that may come to.  A person or another machine that moves an axis
+brings energy too; it is as good a reason to stop.
+"""
+
+from collections.abc import Sequence
+from math import exp
+
+STAYS = 1.0
+"""Seconds after which a share of 1 / e is left of an energy: of a swing of 8 Hz with 1 % of damping."""
+DELAY = 0.003
+"""Seconds by which position and torque may be told apart (filters, delays): it turns work done into work
+given back, where both change fast."""
+SCALE = 0.1
+"""Share by which a torque may be told wrong, against that of another axis."""
+ROUNDING = 0.25
+"""Position units that a position is beside the true one, when the torque changes."""
+FRICTION = 0.5
+"""Share of the friction learned that is sure to be lost."""
+WEIGHT = 2.0
+"""Times the torque that holds an axis which its weight, or a balancing spring, may come to."""
+FIRST = 20
+"""Samples in the beginning of a motion whose mean torque holds the axis."""
+RUN_UP = 0.01
+"""Seconds in which the torque limit gives an axis from rest the energy that may be missing at the end,
+and that may be there in the beginning, from blows and old swings."""
+LATELY = 0.1
+"""Seconds over which it is judged which axis gave back most."""
+
+
+class Balance:
+    """The energy that one axis' motor has brought in, and that may still be there, J.
+
+    Parameters
+    ----------
+    position_unit, torque_unit
+        rad or m, N m or N.
+    torque
+        Torque limit, N m or N.
+    inertia
+        Of the whole axis by its prior model, kg m2 or kg.
+    cycle_time
+        s.
+    weight
+        Torque that does not come from friction as far as is known, N m or N.
+    """
+
+    def __init__(
+        self,
+        position_unit: float,
+        torque_unit: float,
+        torque: float,
+        inertia: float,
+        cycle_time: float,
+        weight: float = 0.0,
+    ) -> None:
+        self._position_unit, self._torque_unit = position_unit, torque_unit
+        self._stays, self._lately = exp(-cycle_time / STAYS), exp(-cycle_time / LATELY)
+        self._delay = DELAY / cycle_time
+        self._weight = abs(weight)
+        self._first: list[float] = []
+        self._before: tuple[int, float] | None = None
+        self._low = self._high = 0
+        self.spare = 0.5 * (torque * RUN_UP) ** 2 / inertia
+        """What may be missing before it is sure that something is wrong."""
+        self.brought = self.spare
+        """What it has brought in that may still be there."""
+        self.lately = 0.0
+        """What it has brought in lately, nothing in its favour."""
+
+    def take(
+        self, position: int, torque: int, cycles: float, friction: float, *, enabled: bool
+    ) -> None:
+        """Take the next sample, in units, so many cycles after the one before."""
+        now = torque * self._torque_unit if enabled else 0.0
+        place, before = self._before or (position, now)
+        self._before = position, now
+        way = abs(position - place) * self._position_unit
+        work = (before + now) / 2 * (position - place) * self._position_unit
+        doubt = SCALE * abs(work) + abs(now - before) * (
+            self._delay * way + ROUNDING * self._position_unit
+        )
+        if cycles != 1.0:
+            doubt += (abs(before) + abs(now)) * way
+        lost = FRICTION * friction * self._torque_unit * way
+        self.brought = self._stays * self.brought + work + doubt - lost
+        self.lately = self._lately * self.lately + work
+        if enabled:
+            self._note_weight(now, position)
+
+    def _note_weight(self, torque: float, position: int) -> None:
+        if not self._first:
+            self._low = self._high = position
+        self._low, self._high = min(self._low, position), max(self._high, position)
+        if len(self._first) < FIRST:
+            self._first.append(torque)
+            self._weight = max(self._weight, abs(sum(self._first)) / FIRST)
+
+    @property
+    def stored(self) -> float:
+        """What its weight may have stored before, and given back by now."""
+        return WEIGHT * self._weight * (self._high - self._low) * self._position_unit
+
+
+def reversed_axis(balances: Sequence[Balance]) -> int | None:
+    """Return which axis' motor turns against its torque, by number; None if none does for sure."""
+    worst = min(range(len(balances)), key=lambda k: balances[k].lately)
+    missing = -sum(one.brought + one.stored for one in balances)
+    return worst if missing > balances[worst].spare else None
