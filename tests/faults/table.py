@@ -266,7 +266,7 @@ ROWS: tuple[Row, ...] = (
         harmless("it has booted again before it is used"),
         stopped(r"arm: node 12 left NMT operational \(it rebooted\)"),
         stopped(r"arm: node 12 left NMT operational \(it rebooted\)"),
-        restored("arm.*0x2010"),
+        restored("arm: node 12 has restarted since its parameters were backed up"),
     ),
     _emergency(0x1000, ErrorRegister.GENERIC, "generic", "generic error"),
     _emergency(0x2310, ErrorRegister.CURRENT, "current", "current, device output side"),

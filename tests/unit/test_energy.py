@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
@@ -79,6 +79,7 @@ def test_a_load_that_swings_on_a_spring_is_no_alarm(fresh_rng, counts):
     assert against > 20
 
 
+@settings(max_examples=40, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 4), st.floats(0.0, 0.003))
 def test_coupled_masses_and_springs_never_give_back_more_than_they_were_given(seed, axes, delay):
     """Whatever torques do to them: noise, swings, motors that hold others or are off."""
