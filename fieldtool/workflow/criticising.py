@@ -17,6 +17,7 @@ from fieldtool.identify.recorded import identify_recording
 from fieldtool.records.model import MachineModel
 from fieldtool.records.model_file import read_model, write_model
 from fieldtool.records.recording import Recording, load
+from fieldtool.records.same_axes import axes_differ
 from fieldtool.records.session_folder import SessionFolder
 from fieldtool.records.yaml_file import write_yaml
 from fieldtool.report.criticism_picture import draw_criticism
@@ -254,6 +255,6 @@ def _place(effect: str, axis: Any, location: str | None = None) -> Place:
 
 def alike(prior: MachineModel | None, model: MachineModel) -> MachineModel | None:
     """Return the prior model if it is of the same axes, without effects."""
-    if prior is None or prior.names != model.names:
+    if prior is None or axes_differ(prior.axes, "the model", model.axes):
         return None
     return replace(prior, effects=())

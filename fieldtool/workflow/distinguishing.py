@@ -21,12 +21,13 @@ from fieldtool.experiment.multisine.plan import MultisinePlan
 from fieldtool.frf.velocity_band import white_noise
 from fieldtool.identify.likelihood.expected import Noise, expected_accuracy
 from fieldtool.records.model import MachineModel
-from fieldtool.records.model_file import read_model, write_model
+from fieldtool.records.model_file import write_model
 from fieldtool.records.recording import Recording, load, save
+from fieldtool.records.same_axes import axes_differ
 from fieldtool.records.session_folder import SessionFolder
 from fieldtool.workflow.criticising import alike, keep
 from fieldtool.workflow.fast_measuring import SEED, FastMeasurement
-from fieldtool.workflow.models import prior_model
+from fieldtool.workflow.models import model_of, prior_model
 from fieldtool.workflow.planning import PlannedFast, Wanted, excitations, plan_main, plan_pilot
 from fieldtool.workflow.proposals import Ground, Proposal, expected_data, proposals
 from fieldtool.workflow.reporting import report
@@ -91,15 +92,10 @@ def question_of(folder_path: Path, machine: MachineProfile) -> Question:
     """
     folder = SessionFolder.existing(folder_path)
     folder.needed(folder.criticism, "`fieldtool criticise` on this folder")
-    model, recording = read_model(folder.model), load(folder.recording)
+    model, recording = model_of(machine, folder.model), load(folder.recording)
+    if differ := axes_differ(recording.axes, f"the machine {machine.name}", machine.axes):
+        raise FileFormatError(folder.recording, f"{differ}, or measure the machine anew.")
     criticism = read_criticism(folder.criticism, model)
-    names = tuple(a.name for a in machine.axes)
-    if model.names != names or recording.names != names:
-        raise FileFormatError(
-            folder_path,
-            f"is a session with the axes {', '.join(recording.names)}; {machine.name} has "
-            f"{', '.join(names)}.",
-        )
     tied = [c for c in criticism.causes if c.ties]
     if not tied:
         raise PlanRefusedError(

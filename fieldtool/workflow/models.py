@@ -12,6 +12,7 @@ from fieldtool.errors import FileFormatError, IdentificationError, PlanRefusedEr
 from fieldtool.experiment.plausible import FAR_OFF
 from fieldtool.records.model import AxisModel, Coupling, Estimate, FloatArray, MachineModel
 from fieldtool.records.model_file import read_model
+from fieldtool.records.same_axes import axes_differ
 from fieldtool.workflow.session import Options
 
 
@@ -51,15 +52,8 @@ def model_of(machine: MachineProfile, path: Path) -> MachineModel:
         If it is no model, or its axes are not the machine's in name, kind and order.
     """
     model = read_model(path)
-    found, needed = (
-        [f"{axis.name} ({axis.kind})" for axis in axes] for axes in (model.axes, machine.axes)
-    )
-    if found != needed:
-        raise FileFormatError(
-            path,
-            f"has the axes {', '.join(found)}, the machine {machine.name} has {', '.join(needed)}: "
-            "give them the same names and kinds in the same order, or identify the machine again.",
-        )
+    if differ := axes_differ(model.axes, f"the machine {machine.name}", machine.axes):
+        raise FileFormatError(path, f"{differ}, or identify the machine again.")
     return model
 
 

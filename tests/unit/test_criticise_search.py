@@ -97,7 +97,7 @@ def test_a_library_without_it_gives_no_other_name_to_a_delay(fresh_rng):
 
 def test_a_model_of_other_axes_is_refused(fresh_rng):
     other = replace(MODEL, axes=(MODEL.axes[0],), couplings=())
-    with pytest.raises(NotEnoughDataError, match="same axes in the same order"):
+    with pytest.raises(NotEnoughDataError, match="same names and kinds in the same order"):
         criticise(recorded(fresh_rng, 0.0), other)
 
 

@@ -15,6 +15,7 @@ from fieldtool.criticise.simulate.motion import Motion, motions_of
 from fieldtool.errors import NotEnoughDataError
 from fieldtool.records.model import MachineModel
 from fieldtool.records.recording import AxisInfo, Recording
+from fieldtool.records.same_axes import axes_differ
 
 FloatArray = NDArray[np.float64]
 
@@ -81,11 +82,8 @@ def prepare(recording: Recording, model: MachineModel, contiguous: bool = False)
     NotEnoughDataError
         If there is nothing to compare, or the model is of other axes.
     """
-    if model.names != recording.names:
-        raise NotEnoughDataError(
-            f"the model has the axes {', '.join(model.names)}, the recording "
-            f"{', '.join(recording.names)}: give a model of the same axes in the same order."
-        )
+    if differ := axes_differ(model.axes, "the recording", recording.axes):
+        raise NotEnoughDataError(f"the model {differ}, or identify the recording again.")
     experiments = usable_experiments(recording)
     spans = spans_of(recording, experiments, contiguous)
     motions = {m.experiment: m for m in motions_of(recording, experiments, spans.top)}

@@ -38,6 +38,7 @@ from fieldtool.identify.moves.record_spectra import Spectra
 from fieldtool.identify.moves.spectra import refine_spectra, torque_residuals
 from fieldtool.records.model import AxisModel, Coupling, Estimate, Kind, MachineModel
 from fieldtool.records.recording import Experiment, Recording
+from fieldtool.records.same_axes import axes_differ
 
 FloatArray = NDArray[np.float64]
 STEPS = 3
@@ -130,11 +131,8 @@ def _start(
     prior: MachineModel | None,
 ) -> tuple[MachineModel, FrequencyResponse | None]:
     if prior is not None:
-        if prior.names != recording.names:
-            raise NotEnoughDataError(
-                f"the prior model has the axes {', '.join(prior.names)}, the recording "
-                f"{', '.join(recording.names)}: give a model of the same axes in the same order."
-            )
+        if differ := axes_differ(prior.axes, "the recording", recording.axes):
+            raise NotEnoughDataError(f"the prior model {differ}.")
         if all(len(axis.masses) == lengths[axis.name] for axis in prior.axes):
             return replace(prior, effects=()), None
     if set(lengths.values()) == {1}:
