@@ -1,6 +1,9 @@
 """Objects that are changed while the tool runs, and put back afterwards."""
 
+from collections.abc import Callable
+from functools import partial
 from math import remainder
+from typing import TypeVar
 
 from drives import objects
 from drives.canopen_drive.drive import CanopenDrive
@@ -14,6 +17,8 @@ from drives.errors import (
 )
 from drives.objects import ObjectAddress, ObjectInfo, type_bits
 from drives.profile import UNKNOWN
+
+Held = TypeVar("Held", bound=int | float | str | None)
 
 PDO_OFF = 1 << 31
 NO_MODE = 0
@@ -36,6 +41,36 @@ INPUTS = (objects.STATUSWORD, objects.POSITION_ACTUAL, objects.TORQUE_ACTUAL)
 PDOS = ((0x1400, 0x1600), (0x1800, 0x1A00))
 """Communication and mapping objects of the first PDO each way: it is mapped anew, the next three are
 switched off."""
+
+
+def read_twice(
+    axis: str, info: ObjectInfo, read: Callable[[], Held], ending: str = "It was not changed."
+) -> Held:
+    """Return what an object holds, read two times: what a wrong answer said would be written back.
+
+    Parameters
+    ----------
+    axis, info
+        Which object.
+    read
+        Reads it; None where it holds nothing that could be written again.
+    ending
+        What else to do where the two differ, and what was not done.
+
+    Raises
+    ------
+    NotSupportedError
+        If the two differ.
+    """
+    first, again = read(), read()
+    if first != again:
+        one, other = ("nothing that can be kept" if v is None else v for v in (first, again))
+        raise NotSupportedError(
+            f"{axis}, object {info.address} ({info.name}): read as {one}, then as {other}, and what it "
+            "holds is to be brought back if need be. Check the bus, and that nobody else writes to the "
+            f"drive, and try again. {ending}"
+        )
+    return first
 
 
 class TemporaryObjects:
@@ -71,7 +106,7 @@ class TemporaryObjects:
             )
 
     def before(self, info: ObjectInfo) -> float:
-        """Read what is to be written back later; twice, for a wrong answer must not become a parameter.
+        """Read what is to be written back later.
 
         Raises
         ------
@@ -80,15 +115,7 @@ class TemporaryObjects:
         SdoError
             If it can not be read.
         """
-        before = self._drive.read_number(info)
-        again = self._drive.read_number(info)
-        if again != before:
-            raise NotSupportedError(
-                f"{self._drive.axis}, object {info.address} ({info.name}): read as {before}, then as "
-                f"{again}. It changes by itself, or answers come wrong: it was not changed. Check the "
-                "bus, and that nobody else writes to the drive."
-            )
-        return before
+        return read_twice(self._drive.axis, info, partial(self._drive.read_number, info))
 
     def note(self, info: ObjectInfo, before: float, matters: bool = True) -> None:
         """Remember a value to be written when all is put back.

@@ -12,11 +12,12 @@ from typing import Any
 import yaml
 
 from drives.canopen_drive import CanopenDrive
+from drives.canopen_drive.setup import read_twice
 from drives.errors import DriveFaultError, ProfileError, SdoAbortError
 from drives.objects import DATA_TYPES, ObjectAddress, ObjectInfo
 from drives.parameters.durable import write_durably
 from drives.parameters.set_up import read_set_up
-from drives.parameters.values import HeldObject, Raw, checked_value, read_twice
+from drives.parameters.values import HeldObject, Raw, checked_value
 from drives.profile import read_yaml
 
 FORMAT = "fieldtool-parameters/1"
@@ -95,7 +96,10 @@ def back_up(machine: str, drives: Iterable[CanopenDrive]) -> Backup:
     return Backup(machine, datetime.now(UTC).isoformat(timespec="seconds"), tuple(parts))
 
 
-_CHANGES = "; if the drive changes it by itself, add it to `volatile_commands` in the drive profile"
+_CHANGES = (
+    "If the drive changes it by itself, add it to `volatile_commands` in the drive profile. "
+    "Nothing was written."
+)
 
 
 def _read(drive: CanopenDrive, info: ObjectInfo) -> Raw | None:

@@ -20,11 +20,12 @@ from drives.canopen_drive.setup import (
     count_of,
     entry_of,
     kind_of,
+    read_twice,
 )
 from drives.canopen_drive.torque_offset import TORQUE_OFFSET
 from drives.errors import DrivesError, ProfileError, SdoAbortError
 from drives.objects import ObjectAddress, ObjectInfo
-from drives.parameters.values import HeldObject, ParameterDrive, read_twice, same
+from drives.parameters.values import HeldObject, ParameterDrive, same
 
 MOST_ENTRIES = 64
 """That a PDO can map (CiA 301, clause 7.5.2.36)."""
@@ -64,7 +65,7 @@ def _held(drive: ParameterDrive, info: ObjectInfo) -> Iterator[HeldObject]:
             return drive.read_optional(info)
         return None
 
-    value = read_twice(drive.axis, info, read)
+    value = read_twice(drive.axis, info, read, "Nothing was written.")
     if value is not None:
         yield HeldObject(info, value)
 

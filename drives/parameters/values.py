@@ -1,12 +1,10 @@
 """What one object of a drive holds, and when two values of it are the same."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
 from drives.api import Drive
 from drives.cia402 import PowerState
-from drives.errors import NotSupportedError
 from drives.objects import ObjectAddress, ObjectInfo
 from drives.profile import AxisProfile, DriveProfile
 
@@ -77,36 +75,6 @@ class HeldObject:
 
     info: ObjectInfo
     value: Raw
-
-
-def read_twice(
-    axis: str, info: ObjectInfo, read: Callable[[], Raw | None], otherwise: str = ""
-) -> Raw | None:
-    """Return what an object holds, read two times: what a wrong answer said would be written back.
-
-    Parameters
-    ----------
-    axis, info
-        Which object.
-    read
-        Reads it; None where it holds nothing that could be written again.
-    otherwise
-        What to do where the drive changes it by itself.
-
-    Raises
-    ------
-    NotSupportedError
-        If the two differ.
-    """
-    first, again = read(), read()
-    if first != again:
-        one, other = ("nothing that can be kept" if v is None else v for v in (first, again))
-        raise NotSupportedError(
-            f"{axis}, object {info.address} ({info.name}): read as {one}, then as {other}, and what it "
-            "holds is to be brought back if need be. Check the bus, and that nobody else writes to the "
-            f"drive, and try again{otherwise}. Nothing was written."
-        )
-    return first
 
 
 def same(info: ObjectInfo, one: Raw, other: Raw) -> bool:

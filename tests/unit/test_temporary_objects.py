@@ -1,6 +1,7 @@
 """What is changed for a while: a wrong reading must not be written back as a parameter."""
 
 from contextlib import nullcontext
+from math import nan
 
 import pytest
 
@@ -31,7 +32,7 @@ class Drive:
         self.value = self.value if self.writings in self.deaf else value
 
 
-@pytest.mark.parametrize("wrong", [{1: 3916780366}, {2: 3916780366}])
+@pytest.mark.parametrize("wrong", [{1: 3916780366}, {2: 3916780366}, {1: nan, 2: nan}])
 def test_two_readings_that_differ_are_not_acted_on(wrong):
     drive = Drive(7, wrong)
     changes = TemporaryObjects(drive)
