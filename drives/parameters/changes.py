@@ -8,6 +8,7 @@ from drives.canopen_drive import CanopenDrive
 from drives.canopen_drive.conversion import Conversion
 from drives.errors import NotSupportedError
 from drives.objects import COMMANDS, ObjectAddress, ObjectInfo
+from drives.parameters.filters import filter_not_known
 from drives.parameters.guard import parameter_types
 from drives.parameters.values import Raw, same
 from drives.profile import UNKNOWN, ParameterInfo
@@ -73,7 +74,7 @@ def read_loop(drive: CanopenDrive) -> dict[str, float]:
     Raises
     ------
     NotSupportedError
-        If neither tells them: then nobody knows what a target would do.
+        If neither tells them, or not what a filter does: then nobody knows what a target would do.
     """
     conversion = drive.conversion()
     values = conversion.as_cascade(read_parameters(drive))
@@ -84,6 +85,8 @@ def read_loop(drive: CanopenDrive) -> dict[str, float]:
                 "while they differ the drive changes its gains by itself, and what a target does is not "
                 "predicted. Give both the same value first."
             )
+    if why := filter_not_known(values, drive.profile):
+        raise NotSupportedError(f"{drive.axis}: nobody knows what a target would do: {why}")
     lacking = [name for name in CASCADE_PARAMETERS if name not in values]
     if not lacking:
         return values

@@ -13,6 +13,7 @@ from drives.canopen_drive.group import profile_of
 from drives.errors import NotSupportedError, ProfileError
 from drives.objects import ObjectAddress, ObjectInfo
 from drives.parameters import DriveBackup, load_backup
+from drives.parameters.filters import filter_not_known
 from drives.profile import UNKNOWN, AxisProfile, DriveProfile, MachineProfile
 from drives.profile.eds import range_at, read_eds
 from fieldtool.design.drive_side import FILTERS, GAINS, DriveSide, Hold
@@ -23,11 +24,6 @@ from fieldtool.records.session_folder import SessionFolder
 
 SEEN = 20_000
 """Rows of a recording in which the steps of its encoders are looked for."""
-NUMBERS_OF_FILTERS = {
-    1: ("frequency", "zero_damping", "pole_damping"),
-    2: ("frequency", "pole_damping"),
-}
-"""That a filter of each type needs: notch, low-pass."""
 REAL_LARGEST = {"REAL32": 3.4e38, "REAL64": 1.7e308}
 
 
@@ -249,7 +245,7 @@ def _present(
         values = conversion.as_cascade(values)
     except NotSupportedError as error:
         return given, "" if given else str(error)
-    if why := _filter_not_whole(values, axis, profile):
+    if why := filter_not_known(values, profile) or _filter_at_no_frequency(values, axis, profile):
         return None, why
     if any(name not in values for name in GAINS):
         lacking = ", ".join(name for name in GAINS if name not in values)
@@ -262,19 +258,14 @@ def _present(
     return values, ""
 
 
-def _filter_not_whole(values: Mapping[str, float], axis: AxisProfile, profile: DriveProfile) -> str:
-    """Return why nobody knows what a filter that is on does; empty where all are known."""
+def _filter_at_no_frequency(
+    values: Mapping[str, float], axis: AxisProfile, profile: DriveProfile
+) -> str:
+    """Return which filter is on at 0 Hz and stays so, because it can not be set; empty: none."""
     settable = DriveSide(axis.name, profile.tunable).filters
     for k in FILTERS:
-        numbers = NUMBERS_OF_FILTERS.get(round(values.get(f"filter{k}_type", 0.0)), ())
-        lacking = [name for n in numbers if (name := f"filter{k}_{n}") not in values]
-        if lacking:
-            return (
-                f"filter {k} is on, and {', '.join(lacking)} can not be read in SI units (drive "
-                f"profile {profile.name}). Switch it off in the drive, or enter them in a drive profile "
-                "of your own."
-            )
-        if numbers and k not in settable and not values[f"filter{k}_frequency"] > 0:
+        on = values.get(f"filter{k}_type", 0.0) != 0
+        if on and k not in settable and not values[f"filter{k}_frequency"] > 0:
             return (
                 f"filter {k} is on, at {values[f'filter{k}_frequency']:g} Hz, and can not be set by "
                 "this tool. Switch it off in the drive, or give it a frequency above 0 there."

@@ -16,6 +16,7 @@ from drives.errors import ProfileError
 from drives.parameters import back_up, planned_changes, read_loop, save_backup
 from drives.parameters.backup import checksum
 from drives.profile import load_machine
+from drives.sim.faults import SdoRefused
 from drives.units import position_factor
 from fieldtool.cli.main import main
 from fieldtool.design.drive_side import GAINS, DriveSide
@@ -278,6 +279,15 @@ def no_filter_frequency(parameters: dict[str, Any]) -> None:
     del parameters["filter1_frequency"]
 
 
+def filter_of_another_unit(parameters: dict[str, Any]) -> None:
+    condition = {"object": "0x2020:01", "type": "UNSIGNED8", "equals": 99}
+    parameters["filter1_type"] |= {"only_if": condition}
+
+
+def filter_types_of_its_own(parameters: dict[str, Any]) -> None:
+    parameters["filter1_type"] |= {"scale": 7.0}
+
+
 def little_velocity_p(parameters: dict[str, Any]) -> None:
     parameters["velocity_p"] |= {"minimum": 1000.0, "maximum": 2000.0}
 
@@ -404,6 +414,16 @@ def test_no_controller_is_designed_from_another_machines_model(
         (no_zero_damping, 1, "filter 1 is on, and filter1_zero_damping can not be read in SI"),
         (no_zero_damping, 2, ""),
         (lambda _: None, 1, ""),
+        (
+            lambda _: None,
+            3,
+            "filter 1 is of type 3 (filter1_type, object 0x2020:01, drive profile ",
+        ),
+        (
+            filter_of_another_unit,
+            0,
+            "whether filter 1 is on can not be read (filter1_type, object 0x20",
+        ),
     ],
 )
 def test_a_filter_that_is_on_and_not_known_is_said(
@@ -426,3 +446,54 @@ def test_a_filter_at_no_frequency_that_can_not_be_set_is_said(tmp_path: Path) ->
     own.write_text(own.read_text() + "gains_via: read-only\n")
     tuning = redesign(folder.path, "soft")
     assert any("filter 1 is on, at 0 Hz, and can not be set" in note for note in tuning.notes)
+
+
+@pytest.mark.parametrize("held", [3, 255])
+def test_a_filter_of_an_unknown_type_is_said_of_the_backup(tmp_path: Path, held: int) -> None:
+    """It counted as off: what it does to the loop was left out."""
+    folder = session(tmp_path, ("reference", "reference"))
+    held_before(folder, 1, {"0x2021:01": held})
+    tuning = redesign(folder.path, "soft")
+    assert tuning.present is None
+    said = [note for note in tuning.notes if "can not be compared" in note]
+    assert said == [
+        f"arm: its present parameters can not be compared: filter 2 is of type {held} (filter2_type, "
+        "object 0x2021:01, drive profile reference), and only 0 (off), 1 (notch) and 2 (low-pass) are "
+        "known. Set one of them in the drive, or correct the drive profile."
+    ]
+
+
+@pytest.mark.parametrize(
+    ("change", "kind", "refused", "said"),
+    [
+        (no_filter_frequency, 1, (), "table: nobody knows what a target would do: filter 1 is on, and "
+         "filter1_frequency can not be read in SI units"),
+        (filter_types_of_its_own, 1, (), "table: nobody knows what a target would do: filter 1 is of "
+         "type 7 (filter1_type, object 0x2020:01, drive profile"),
+        (lambda _: None, 1, (0x2020, 2), "table, object 0x2020:02"),
+        (lambda _: None, 0, (0x2020, 1), "table, object 0x2020:01"),
+    ],
+)  # fmt: skip
+def test_nothing_moves_where_a_drive_does_not_tell_its_filters(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    change: Callable[[dict[str, Any]], None],
+    kind: int,
+    refused: tuple[int, ...],
+    said: str,
+) -> None:
+    machine = machine_of(("reference", "reference"), tmp_path)
+    folder = SessionFolder.create(tmp_path)
+    lacking(folder, change)
+    with simulated(machine) as running:
+        node = running.node(machine.axes[0].node_id)
+        node.dictionary.force(0x2020, 1, kind)
+        if refused:
+            running.inject(SdoRefused(node.node_id, *refused, code=0x06020000))
+        out = tmp_path / "measured"
+        assert main_code(["measure", str(machine.path), "--yes", "--out", str(out)]) == 3
+        assert running.sync_count == 0, "nothing moved"
+    told = " ".join(capsys.readouterr().err.split())
+    assert said in told
+    assert "Traceback" not in told
+    assert "defect" not in told
