@@ -106,6 +106,8 @@ class DriveSide:
     unreadable: str = ""
     """Why not, in words."""
     kind: Kind = "rotary"
+    is_pid: bool = False
+    """Whether the drive's loop is one PID, also where it is not known how it holds some of it."""
 
     def words(self, name: str, value: float) -> str:
         """Return a parameter's value with its unit."""
@@ -135,11 +137,6 @@ class DriveSide:
         """Return how the drive holds a parameter; None: any number.  A PID's D is the velocity's P."""
         whole = name == "velocity_p" and self.is_pid
         return self.holds.get("pid_d" if whole else name)
-
-    @property
-    def is_pid(self) -> bool:
-        """Whether the drive's loop is one PID."""
-        return all(name in self.holds for name in PID)
 
     def check_gains(self) -> None:
         """Refuse a drive that holds nothing above 0 of a gain that no loop goes without.
@@ -188,7 +185,7 @@ class DriveSide:
         """Return I, or less of it where a PID with this I is no cascade: P^2 >= 4 I D."""
         if p * p >= 4 * i * d:
             return i
-        hold, most = self.holds["pid_i"], 0.999 * p * p / (4 * d)
+        hold, most = self.holds.get("pid_i", Hold()), 0.999 * p * p / (4 * d)
         for wanted in (most, most - hold.scale):  # rounded up it may be too much
             less = hold.nearest(max(wanted, 0.0))
             if p * p >= 4 * less * d:
@@ -242,10 +239,13 @@ class DriveSide:
     def servo(self, parameters: Mapping[str, float]) -> Servo:
         """Return the controller that parameters make of this drive.
 
-        What the drive can not be told keeps the value that it has now.
+        What the drive can not be told keeps the value that it has now; a PID feeds the whole velocity
+        forward.
         """
-        kept = {k: v for k, v in (self.present or {}).items() if k not in parameters}
-        return servo_from_parameters({**kept, **parameters}, self.timing)
+        values = {**(self.present or {}), **parameters}
+        if self.is_pid:
+            values["velocity_ff"] = 1.0
+        return servo_from_parameters(values, self.timing)
 
     @property
     def present_servo(self) -> Servo | None:

@@ -129,6 +129,7 @@ def _side(axis: AxisProfile, machine: MachineProfile, kept: _Kept, cycle: float)
         present,
         why,
         axis.kind,
+        profile.structure == "pid",
     )
 
 

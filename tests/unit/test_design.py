@@ -265,7 +265,7 @@ def test_a_pid_drive_gets_the_cascade_that_its_numbers_are(random_model: RandomM
     (side,) = sides_of(model)
     names = frozenset({"pid_p", "pid_i", "pid_d", "position_p", "velocity_p", "velocity_i"})
     holds = {name: Hold(1.0, whole=True, low=0, high=2**31) for name in ("pid_p", "pid_i", "pid_d")}
-    tuning = design(model, [replace(side, tunable=names, holds=holds)])
+    tuning = design(model, [replace(side, tunable=names, holds=holds, is_pid=True)])
     kp, kv, ki = (tuning.axes[0].parameters[n] for n in ("position_p", "velocity_p", "velocity_i"))
     for number in (kv * kp + ki, ki * kp, kv):
         assert number == pytest.approx(round(number), abs=1e-6 * number)

@@ -217,9 +217,9 @@ def test_a_gain_of_another_unit_than_the_profiles_is_not_read(tmp_path: Path, un
     folder = session(tmp_path, ("reference", "epos4"))
     held_before(folder, 1, {"0x30A1:09": unit})
     side = drive_sides(folder, load_machine(folder.machine))[1]
+    assert side.is_pid
     if unit == 0xFA040300:
         assert side.present is not None
-        assert side.is_pid
     else:
         assert side.present is None
         assert (
@@ -228,6 +228,9 @@ def test_a_gain_of_another_unit_than_the_profiles_is_not_read(tmp_path: Path, un
         )
         assert f"the drive has {unit}." in side.unreadable
         assert "pid_i" not in side.holds
+        assert f"arm: its present parameters can not be compared: {side.unreadable}" in (
+            redesign(folder.path, "soft").notes
+        )
 
 
 def test_parameters_are_designed_for_the_controllers_own_cycle_where_the_profile_has_it(

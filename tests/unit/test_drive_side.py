@@ -19,7 +19,7 @@ def rigid(mass: float) -> MachineModel:
 
 
 def pid_side(hold: Hold, torque: float = 5.0) -> DriveSide:
-    return DriveSide("x", NAMES, torque_limit=torque, holds=dict.fromkeys(PID, hold))
+    return DriveSide("x", NAMES, torque_limit=torque, holds=dict.fromkeys(PID, hold), is_pid=True)
 
 
 def pid_of(parameters: dict[str, float]) -> tuple[float, float, float]:
@@ -83,7 +83,7 @@ def test_an_integral_that_can_not_be_little_enough_is_said() -> None:
     holds = dict.fromkeys(PID, Hold(0.01, whole=True, low=4, high=4))
     holds["pid_i"] = Hold(0.01, whole=True, low=10, high=90)
     with pytest.raises(DesignError, match=r"x: the least I that its drive holds .* is too much"):
-        DriveSide("x", holds=holds).held(dict.fromkeys(GAINS, 0.1))
+        DriveSide("x", holds=holds, is_pid=True).held(dict.fromkeys(GAINS, 0.1))
 
 
 def test_a_small_motor_on_a_drive_of_coarse_steps_is_designed_and_said() -> None:
@@ -109,3 +109,17 @@ def test_a_pid_that_does_not_fit_is_said_by_what_the_drive_is_told(hold: Hold, s
 def test_a_pid_at_the_end_of_its_range_is_said() -> None:
     tuning = design(rigid(0.05), [pid_side(Hold(0.001, whole=True, low=0, high=1e4))])
     assert any("the largest that its drive holds: pid_p 10 N m/rad" in n for n in tuning.notes)
+
+
+def test_a_pid_stays_one_where_the_unit_of_its_integral_is_not_known() -> None:
+    """P and D are rounded as what the drive is told, and the whole velocity is fed forward."""
+    hold = Hold(0.01, whole=True, low=0, high=1e4)
+    side = DriveSide("x", NAMES, holds={"pid_p": hold, "pid_d": hold}, is_pid=True)
+    held = side.held({"position_p": 20.0, "velocity_p": 0.104, "velocity_i": 0.05})
+    p, i, d = pid_of(held)
+    assert (p, d) == (pytest.approx(2.13), pytest.approx(0.10))
+    assert i == pytest.approx(1.0), "as it was"
+    assert side.servo(held).loop.velocity_ff == 1.0
+    p, i, d = pid_of(side.held({"position_p": 4.0, "velocity_p": 0.004, "velocity_i": 0.016}))
+    assert i == pytest.approx(p * p / (4 * d), rel=2e-3), "no cascade has more"
+    assert DriveSide("x").servo(held).loop.velocity_ff == 0.0
