@@ -1,8 +1,8 @@
 """What a drive allows a design to use: its parameters, their steps and ranges, timing, encoder."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from math import inf, isclose, isfinite, nan
+from dataclasses import dataclass, field, replace
+from math import inf, isclose, isfinite, nan, prod
 
 from drives.units import Kind, unit_on
 from fieldtool.design.rule import DesignError
@@ -42,6 +42,17 @@ class Hold:
     minimum: float = -inf
     maximum: float = inf
     """Bounds of the physical value."""
+    times: Mapping[str, int] = field(default_factory=dict)
+    """Parameters before it that the scale goes with, with their powers."""
+
+    def beside(self, others: Mapping[str, float]) -> "Hold":
+        """Return how it is held while those parameters are so; anything where one is not known or 0."""
+        if not self.times:
+            return self
+        if any(name not in others for name in self.times):
+            return Hold()
+        scale = self.scale * prod(others[name] ** power for name, power in self.times.items())
+        return replace(self, scale=scale, times={}) if isfinite(scale) and scale > 0 else Hold()
 
     def nearest(self, value: float) -> float:
         """Return the physical value next to one that is wanted, within all bounds.
@@ -100,7 +111,7 @@ class DriveSide:
     resolution: float = nan
     """One step of the encoder, rad or m; NaN: not known."""
     holds: Mapping[str, Hold] = field(default_factory=dict)
-    """By parameter; one that is not named holds any number."""
+    """By parameter, those that others' scales go with first; one that is not named holds any number."""
     present: Mapping[str, float] | None = None
     """What the drive holds now, by parameter, SI; None where it can not be read."""
     unreadable: str = ""
@@ -134,9 +145,18 @@ class DriveSide:
         return tuple(name for name in GAINS if not self.has(name))
 
     def hold_of(self, name: str) -> Hold | None:
-        """Return how the drive holds a parameter; None: any number.  A PID's D is the velocity's P."""
+        """Return how the drive holds a parameter beside the present ones; None: any number.
+
+        A PID's D is the velocity's P.
+        """
         whole = name == "velocity_p" and self.is_pid
-        return self.holds.get("pid_d" if whole else name)
+        hold = self.holds.get("pid_d" if whole else name)
+        return None if hold is None else hold.beside(self.present or {})
+
+    def _holds_beside(self, told: Mapping[str, float]) -> dict[str, Hold]:
+        """Return how the drive holds the parameters that it is told, together."""
+        others = {**(self.present or {}), **told}
+        return {name: hold.beside(others) for name, hold in self.holds.items() if name in told}
 
     def check_gains(self) -> None:
         """Refuse a drive that holds nothing above 0 of a gain that no loop goes without.
@@ -147,14 +167,15 @@ class DriveSide:
             If it is one.
         """
         for name in ABOVE_ZERO:
-            if name in self.holds and not self.holds[name].bounds[1] > 0:
+            hold = self.holds.get(name, Hold()).beside(self.present or {})
+            if not hold.bounds[1] > 0:
                 raise DesignError(
                     f"{self.axis}: its drive holds no {name} above 0, so there is no loop to design; "
                     "nothing is written. Choose other units or ranges in the drive."
                 )
 
     def held(self, parameters: Mapping[str, float]) -> dict[str, float]:
-        """Return parameters as the drive will hold them.
+        """Return parameters as the drive will hold them, each beside what those before it became.
 
         Those of a drive whose loop is one PID come back as the cascade that the rounded PID is.
 
@@ -164,28 +185,26 @@ class DriveSide:
             If the PIDs that such a drive can hold are no cascade, or it holds no gains above 0.
         """
         self.check_gains()
-        told = self._told(parameters)
-        rounded = {
-            name: self._nearest(name, value) if name in self.holds else value
-            for name, value in told.items()
-        }
+        rounded = self._told(parameters)
+        for name in self.holds:
+            if name in rounded:
+                hold = self._holds_beside(rounded)[name]
+                near = hold.above_zero if name in ABOVE_ZERO else hold.nearest
+                rounded[name] = near(rounded[name])
         if not all(name in rounded for name in PID):
             return rounded
+        hold = self._holds_beside(rounded).get("pid_i", Hold())
         p, i, d = (rounded.pop(name) for name in PID)
-        i = self._integral(p, i, d)
+        i = self._integral(hold, p, i, d)
         root = max(p * p - 4 * i * d, 0.0) ** 0.5
         larger = (p + root) / 2
         return rounded | dict(zip(GAINS, (larger / d, d, p - larger), strict=True))
 
-    def _nearest(self, name: str, value: float) -> float:
-        hold = self.holds[name]
-        return hold.above_zero(value) if name in ABOVE_ZERO else hold.nearest(value)
-
-    def _integral(self, p: float, i: float, d: float) -> float:
+    def _integral(self, hold: Hold, p: float, i: float, d: float) -> float:
         """Return I, or less of it where a PID with this I is no cascade: P^2 >= 4 I D."""
         if p * p >= 4 * i * d:
             return i
-        hold, most = self.holds.get("pid_i", Hold()), 0.999 * p * p / (4 * d)
+        most = 0.999 * p * p / (4 * d)
         for wanted in (most, most - hold.scale):  # rounded up it may be too much
             less = hold.nearest(max(wanted, 0.0))
             if p * p >= 4 * less * d:
@@ -210,8 +229,7 @@ class DriveSide:
         return [
             f"{name} {self.words(name, told[name])} (the drive holds {low:.4g} to "
             f"{self.words(name, high)})"
-            for name, hold in self.holds.items()
-            if name in told
+            for name, hold in self._holds_beside(told).items()
             for low, high in [hold.bounds]
             if not low <= told[name] <= high
         ]
@@ -219,21 +237,23 @@ class DriveSide:
     def largest(self, parameters: Mapping[str, float]) -> list[str]:
         """Return gains and inertia fed forward that are the most that the drive holds, a phrase each."""
         told = self._told(parameters)
+        holds = self._holds_beside(told)
         return [
             f"{name} {self.words(name, told[name])}"
             for name in (*GAINS, *PID, "inertia_ff")
-            if name in told and name in self.holds
-            if told[name] >= (1 - 1e-6) * self.holds[name].bounds[1]
+            if name in holds
+            if told[name] >= (1 - 1e-6) * holds[name].bounds[1]
         ]
 
     def smallest(self, parameters: Mapping[str, float]) -> list[str]:
         """Return gains of one step of the drive, the least that make a loop, a phrase each."""
         told = self._told(parameters)
+        holds = self._holds_beside(told)
         return [
             f"{name} {self.words(name, told[name])}"
             for name in ABOVE_ZERO
-            if name in told and name in self.holds and self.holds[name].whole
-            if told[name] <= (1 + 1e-6) * self.holds[name].above_zero(0.0)
+            if name in holds and holds[name].whole
+            if told[name] <= (1 + 1e-6) * holds[name].above_zero(0.0)
         ]
 
     def servo(self, parameters: Mapping[str, float]) -> Servo:

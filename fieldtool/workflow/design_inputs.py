@@ -125,7 +125,7 @@ def _side(axis: AxisProfile, machine: MachineProfile, kept: _Kept, cycle: float)
         timing_of(profile, cycle),
         axis.limits.torque,
         resolution,
-        _holds(profile, conversion, present or {}),
+        _holds(profile, conversion),
         present,
         why,
         axis.kind,
@@ -274,20 +274,15 @@ def _filter_at_no_frequency(
     return ""
 
 
-def _holds(
-    profile: DriveProfile, conversion: Conversion, present: Mapping[str, float]
-) -> dict[str, Hold]:
+def _holds(profile: DriveProfile, conversion: Conversion) -> dict[str, Hold]:
     """Return how the drive holds parameters of known units: within their types and the EDS' limits."""
     dictionary = None if profile.eds_path is None else read_eds(profile.eds_path)
     holds = {}
-    others = dict(present)
     for name, parameter in profile.parameters.items():
         if not conversion.understood(name) or parameter.told_type == UNKNOWN:
             continue
-        missing = [o for o in parameter.times if o not in others and o not in conversion.quantities]
-        if missing:
-            continue
-        scale = conversion.physical(name, 1, others)
+        times = {o: power for o, power in parameter.times.items() if o not in conversion.quantities}
+        scale = conversion.physical(name, 1, dict.fromkeys(times, 1.0))
         if not (isfinite(scale) and scale > 0):
             continue
         taken = range_at(dictionary, ObjectInfo(parameter.object, parameter.type, name))
@@ -305,5 +300,6 @@ def _holds(
             high,
             -inf if parameter.minimum is None else parameter.minimum,
             inf if parameter.maximum is None else parameter.maximum,
+            times,
         )
     return holds

@@ -273,6 +273,28 @@ def no_velocity_i(parameters: dict[str, Any]) -> None:
     del parameters["velocity_i"]
 
 
+def velocity_i_in_steps_of_velocity_p(parameters: dict[str, Any]) -> None:
+    parameters["velocity_i"] |= {"scale": 0.5, "times": {"velocity_p": 1}}
+
+
+def test_a_gain_in_steps_of_another_is_rounded_as_the_drive_is_written(tmp_path: Path) -> None:
+    """The other one is written with it, and is not what the drive holds now."""
+    folder = session(tmp_path, ("reference", "reference"))
+    lacking(folder, velocity_i_in_steps_of_velocity_p)
+    machine = load_machine(folder.machine)
+    side = drive_sides(folder, machine)[0]
+    assert side.present is not None
+    wanted = {n: f * side.present[n] for n, f in zip(GAINS, (1.1, 1.37, 0.0), strict=True)}
+    wanted["velocity_i"] = 3.3 * wanted["velocity_p"]
+    held = side.held(wanted)
+    with simulated(machine), connect(machine) as group:
+        written = {c.name: c for c in planned_changes(group.drives[0], held)}
+    for name in GAINS:
+        assert written[name].after == pytest.approx(held[name], rel=1e-9)
+    assert written["velocity_i"].after_raw == 7  # 6.6 steps
+    assert held["velocity_i"] == pytest.approx(7 * 0.5 * written["velocity_p"].after)
+
+
 def no_zero_damping(parameters: dict[str, Any]) -> None:
     for k in (1, 2):
         del parameters[f"filter{k}_zero_damping"]

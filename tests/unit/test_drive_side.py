@@ -123,3 +123,42 @@ def test_a_pid_stays_one_where_the_unit_of_its_integral_is_not_known() -> None:
     p, i, d = pid_of(side.held({"position_p": 4.0, "velocity_p": 0.004, "velocity_i": 0.016}))
     assert i == pytest.approx(p * p / (4 * d), rel=2e-3), "no cascade has more"
     assert DriveSide("x").servo(held).loop.velocity_ff == 0.0
+
+
+@given(st.floats(0.02, 5.0), st.floats(0.1, 50.0), st.floats(0.1, 3.0))
+def test_a_gain_is_rounded_beside_what_its_scale_goes_with_became(velocity, position, ratio):
+    """Read back by the conversion's own formula, each gain is within half a step of what was wanted.
+
+    The drive's velocity_i is in steps of 0.05 1/s of its velocity_p, which has steps of its own and is
+    far from the present one.
+    """
+    holds = {
+        "velocity_p": Hold(0.01, whole=True, low=0, high=1e6),
+        "velocity_i": Hold(0.05, whole=True, low=0, high=1e6, times={"velocity_p": 1}),
+        "position_p": Hold(2.0, -1, whole=True, low=1, high=1e6, times={"velocity_p": -1}),
+    }
+    present = {"velocity_p": 0.337, "velocity_i": 1.0, "position_p": 10.0}
+    side = DriveSide("x", frozenset(GAINS), holds=holds, present=present)
+    integral = ratio * position * velocity
+    wanted = {"position_p": position, "velocity_p": velocity, "velocity_i": integral}
+    held = side.held(wanted)
+    p = round(held["velocity_p"] / 0.01)
+    i = round(held["velocity_i"] / (0.05 * 0.01 * p))
+    reciprocal = max(round(2.0 / (0.01 * p) / held["position_p"]), 1)
+    assert held["velocity_p"] == pytest.approx(0.01 * p)
+    assert held["velocity_i"] == pytest.approx(0.05 * 0.01 * p * i), "a whole number in the drive"
+    assert held["position_p"] == pytest.approx(2.0 / (0.01 * p) / reciprocal)
+    assert abs(held["velocity_p"] - velocity) <= 0.5 * 0.01 * (1 + 1e-9)
+    assert abs(held["velocity_i"] - integral) <= 0.5 * 0.05 * 0.01 * p * (1 + 1e-9)
+    steps = 2.0 / (0.01 * p) / position
+    assert abs(reciprocal - steps) <= 0.5 * (1 + 1e-9) or steps < 1
+
+
+def test_what_a_scale_goes_with_and_nobody_knows_holds_anything() -> None:
+    hold = Hold(0.05, whole=True, low=0, high=10, times={"velocity_p": 1})
+    side = DriveSide("x", holds={"velocity_i": hold})
+    assert side.held({"velocity_i": 1.2345})["velocity_i"] == 1.2345
+    assert side.held({"velocity_p": 2.0, "velocity_i": 1.2345})["velocity_i"] == pytest.approx(1.0)
+    assert side.out_of_range({"velocity_p": 2.0, "velocity_i": 1.01}) == [
+        "velocity_i 1.01 N m/rad (the drive holds 0 to 1 N m/rad)"
+    ]
