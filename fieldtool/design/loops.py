@@ -62,8 +62,11 @@ class Loops:
             shape (F,).
         """
         motors, torques = self.moved(axis, drive)
-        load = np.einsum("fk,fk->f", self.response.loads[:, axis, :], torques)
-        return motors[:, axis], load, torques[:, axis]
+        return motors[:, axis], self.load(axis, torques), torques[:, axis]
+
+    def load(self, axis: int, torques: ComplexArray) -> ComplexArray:
+        """Return the position of an axis' last mass under the torques of all drives, (F, M)."""
+        return np.asarray(np.einsum("fk,fk->f", self.response.loads[:, axis, :], torques))
 
     def moved(self, axis: int, drive: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
         """Return the positions of all motors, and the torques of all drives, (F, M), as above."""

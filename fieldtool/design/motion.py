@@ -90,18 +90,19 @@ def moved(
     drive = wave.spectrum(wave.move(move))
     loops = Loops(respond(machine, wave.omega), servos)
     s = 1j * wave.omega
-    pushed = servos[axis].reference_gain(s) * drive
-    motor, load, torque = (wave.signal(one) for one in loops.motion(axis, pushed))
-    step = wave.spectrum(wave.step(1.0))
-    stepped = wave.signal(loops.motion(axis, servos[axis].step_gain(s) * step)[0]) + 0.5
+    phasors = loops.moved(axis, servos[axis].reference_gain(s) * drive)
+    motors, torques = (wave.signal(one.T) for one in phasors)
+    load = wave.signal(loops.load(axis, phasors[1]))
+    step = servos[axis].step_gain(s) * wave.spectrum(wave.step(1.0))
+    stepped = wave.signal(loops.compliance[:, axis, axis] * step) + 0.5
     half, time = 0.5 * move.distance, wave.time
     reference = move.at(time)[0]
-    ways = [(motor + half, load + half, torque)]
+    ways = [(motors[axis] + half, load + half, torques[axis])]
     if machine.dry:
-        ways = _dragged_ways(machine, servos, axis, wave, (loops, pushed), ways[0])
+        rubbed = rubbing(machine, loops.response, *phasors)
+        ways = _dragged_ways(machine, servos, axis, wave, rubbed, ways[0])
     curves = Curves(time, reference, ways[0][0], ways[0][1], ways[0][2], time, stepped)
     band = move.settling_band
-    motors, torques = (wave.signal(one.T) for one in loops.moved(axis, pushed))
     speeds = np.gradient(motors, time, axis=1)
     return Moved(
         _worst([move_figures(time, reference, way[0], band) for way in ways]),
@@ -118,16 +119,13 @@ def _dragged_ways(
     servos: tuple[Servo, ...],
     axis: int,
     wave: HalfWave,
-    linear: tuple[Loops, ComplexArray],
+    rubbed: ComplexArray,
     way: tuple[FloatArray, FloatArray, FloatArray],
 ) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
     """Return motor, last mass and torque of the way out and of that back, friction included.
 
     The way back is told as if it were a way out.
     """
-    loops, pushed = linear
-    motors, torques = loops.moved(axis, pushed)
-    rubbed = rubbing(machine, loops.response, motors, torques)
     out = np.column_stack([wave.signal(1j * wave.omega * one) for one in rubbed.T])
     step = wave.duration / wave.samples
     added = dragged(machine, servos, axis, step, np.concatenate([out, -out]))
