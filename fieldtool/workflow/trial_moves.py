@@ -1,10 +1,11 @@
 """An axis' move in a trial: where it goes, how long it is watched, what it may do meanwhile."""
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from drives.api import AxisLimits
 from drives.canopen_drive import CanopenDrive
 from fieldtool.design.moves import TestMove
 from fieldtool.design.predict import AxisPrediction, Prediction
@@ -12,7 +13,7 @@ from fieldtool.errors import PlanRefusedError
 from fieldtool.experiment.forecast import Setting
 from fieldtool.experiment.verification.swings import Swings
 from fieldtool.experiment.verification.trial import TrialMove
-from fieldtool.records.model import FloatArray
+from fieldtool.records.model import AxisModel, FloatArray
 
 ROOM = 0.6
 """Of the way to the end of the travel that a move may use: it may overshoot."""
@@ -65,6 +66,15 @@ def free_move(drive: CanopenDrive, typical: TestMove) -> TestMove:
     return replace(typical, distance=sign * way, band=band)
 
 
+@dataclass(frozen=True)
+class _Taken:
+    """What a move takes of the limits of one axis: of torque, following error and velocity; SI."""
+
+    torque: float
+    following_error: float
+    velocity: float
+
+
 def takes_too_much(
     setting: Setting, k: int, predictions: Sequence[Prediction]
 ) -> tuple[float, str]:
@@ -73,30 +83,46 @@ def takes_too_much(
     The limit, its own or one of an axis beside it, that it comes nearest to; 1 and no words where all
     are kept.
     """
-    most, words = 1.0, ""
+    found = [(1.0, "")]
     for prediction in predictions:
-        one = prediction.axes[k]
-        if one.curves is None or one.move is None or one.beside is None:
-            continue
-        # An axis whose reference stands still is off it by all its way.
-        taken = one.beside.T.tolist()
-        speed = float(np.abs(np.gradient(one.curves.position, one.curves.time)).max())
-        taken[k] = [one.peak_torque, one.move.following_error, speed]
-        for own, limits, values in zip(setting.model.axes, setting.limits, taken, strict=True):
-            torque, length = ("N m", "rad") if own.kind == "rotary" else ("N", "m")
-            beside = "" if own.name == one.axis else f" while {one.axis} moves"
-            for what, value, limit, unit in (
-                ("torque", values[0], limits.torque, torque),
-                ("following error", values[1], limits.following_error, length),
-                ("velocity", values[2], limits.velocity, f"{length}/s"),
-            ):
-                if value > most * KEPT * limit:
-                    most = value / (KEPT * limit)
-                    words = (
-                        f"{own.name}: {what} {value:.3g} {unit}{beside}, {KEPT * limit:.3g} {unit} is "
-                        "allowed"
-                    )
-    return most, words
+        moved = prediction.axes[k]
+        taken = _taken(moved, k)
+        every = zip(setting.model.axes, setting.limits, taken, strict=True) if taken else ()
+        for own, limits, one in every:
+            while_moving = "" if own.name == moved.axis else f" while {moved.axis} moves"
+            found += _shares(own, limits, one, while_moving)
+    return max(found, key=lambda share: share[0])
+
+
+def _taken(moved: AxisPrediction, k: int) -> list[_Taken]:
+    """Return what the move of axis k takes of every axis; of none where it is not predicted.
+
+    An axis whose reference stands still is off it by all its way.
+    """
+    if moved.curves is None or moved.move is None or moved.beside is None:
+        return []
+    taken = [_Taken(*row) for row in moved.beside.T.tolist()]
+    speed = float(np.abs(np.gradient(moved.curves.position, moved.curves.time)).max())
+    taken[k] = _Taken(moved.peak_torque, moved.move.following_error, speed)
+    return taken
+
+
+def _shares(
+    own: AxisModel, limits: AxisLimits, taken: _Taken, while_moving: str
+) -> Iterator[tuple[float, str]]:
+    """Yield the share that is taken of what is allowed of each limit, and that in words."""
+    torque, length = ("N m", "rad") if own.kind == "rotary" else ("N", "m")
+    for name, unit in (
+        ("torque", torque),
+        ("following_error", length),
+        ("velocity", f"{length}/s"),
+    ):
+        value, most = getattr(taken, name), KEPT * getattr(limits, name)
+        yield (
+            value / most,
+            f"{own.name}: {name.replace('_', ' ')} {value:.3g} {unit}{while_moving}, {most:.3g} "
+            f"{unit} is allowed",
+        )
 
 
 def trial_move(
