@@ -185,6 +185,7 @@ _ON_LINEAR_AXES = {
     "kg m2": "kg",
     "rad": "m",
     "rad/s": "m/s",
+    "rad/(N m)": "m/N",
 }
 
 

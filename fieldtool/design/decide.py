@@ -8,6 +8,7 @@ import numpy as np
 
 from fieldtool.design.design import Advance, Softer, Task, find
 from fieldtool.design.drive_side import DriveSide
+from fieldtool.design.given_up import given_up
 from fieldtool.design.held import held
 from fieldtool.design.loops import Loops, system_matrix
 from fieldtool.design.machine import Machine, machine_of, respond
@@ -111,6 +112,7 @@ def design(
         try:
             task = find(model, sides, moves, room, limit, seed, part, softer)
             task.most = room if name == SOFTEST else bound
+            task.softens = name == SOFTEST
             result = _at(task)
         except DesignError:
             if name == response:
@@ -183,6 +185,8 @@ def _as_soft(task: Task, softer: Softer) -> _Result:
 def _tuning(result: _Result, response: str) -> Tuning:
     task, servos, prediction, kept = result.task, result.servos, result.prediction, result.kept
     axes = []
+    now = task.present
+    present = predicted(task, now, spread=False) if now else None
     notes = list(notes_of(task.model, servos))
     if result.instead:
         notes.append(
@@ -196,6 +200,8 @@ def _tuning(result: _Result, response: str) -> Tuning:
         reason = KEPT if k in kept else _reason(task, k, servo)
         axes.append(AxisTuning(side.axis, parameters, axis.margins.sensitivity_peak, reason))
         notes += drive_notes(side, axis, {} if k in kept else parameters)
+        if now and present and present.stable and k not in kept:
+            notes += given_up(side, axis, present.axes[k], (servo, now[k]), response)
     if kept:
         names = ", ".join(task.sides[k].axis for k in sorted(kept))
         notes.append(f"{names}: {KEPT}")
@@ -211,7 +217,7 @@ def _tuning(result: _Result, response: str) -> Tuning:
         task.most if max(peaks, default=0.0) > SLACK * task.bound else task.bound,
         task.moves,
         prediction,
-        predicted(task, task.present, spread=False) if task.present else None,
+        present,
         _trade(task, servos),
         tuple(_shaping(task, servos, prediction)),
         tuple(dict.fromkeys(notes)),

@@ -93,6 +93,8 @@ class Task:
     softer: Softer | None = None
     most: float = 0.0
     """Bound of an axis that keeps its present parameters, for nothing else is as fast."""
+    softens: bool = False
+    """Whether a response was asked for that gives up stiffness."""
     plain: tuple[Best, ...] = ()
     """The rule's controllers, without filters: where a search for structure begins."""
     found: list[Best] = field(default_factory=list)

@@ -11,6 +11,8 @@ from fieldtool.records.model import FloatArray
 ComplexArray = NDArray[np.complexfloating[Any, Any]]
 STEP_BAND = 0.02
 """Of a step's height: within it the step has settled."""
+STRAYS = 1.2
+"""Times a following error, and half the band about the target: one above is clearly larger."""
 CREEPS = 24
 ENOUGH = 2000
 """Samples from which a creep is chosen."""
@@ -102,6 +104,11 @@ def move_figures(
         residual_rms=float(np.sqrt(np.mean(swing**2))),
         band=band,
     )
+
+
+def strays(new: float, was: float, band: float) -> bool:
+    """Return whether a following error is clearly larger than another."""
+    return new > STRAYS * was + band / 2
 
 
 def step_figures(time: FloatArray, position: FloatArray, height: float) -> StepFigures:

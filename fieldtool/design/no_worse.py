@@ -1,9 +1,14 @@
-"""New parameters against those that the drives have: an axis that would be slower keeps its own."""
+"""New parameters against those that the drives have: an axis that would be worse keeps its own.
+
+Worse is slower, and softer where nothing that was asked for takes stiffness.  A motor that strays more
+from its reference is told (:mod:`fieldtool.design.given_up`): that is how the last mass arrives early.
+"""
 
 from math import inf
 
 import numpy as np
 
+from drives.units import unit_on
 from fieldtool.design.design import Task, improved
 from fieldtool.design.held import held
 from fieldtool.design.machine import machine_of
@@ -18,6 +23,8 @@ LONGER = 1.05
 makes new parameters worse."""
 TICK = 0.002
 """s of settling that nobody notices."""
+SOFTER = 1.2
+"""Of the present largest compliance: from it an axis is clearly softer."""
 SPREAD_OF = 8
 """Machines that the prediction's spread is over."""
 SPREAD_SEED = 20
@@ -26,7 +33,7 @@ SPREAD_SEED = 20
 def no_worse(
     task: Task, chosen: tuple[Servo, ...], kept: frozenset[int] = frozenset()
 ) -> tuple[tuple[Servo, ...], frozenset[int]]:
-    """Return controllers of which none is slower than what its drive has, and the axes that keep theirs.
+    """Return controllers of which none is worse than what its drive has, and the axes that keep theirs.
 
     Only present controllers that keep the margin are to be beaten.  The other axes are designed anew
     round those that are kept, where they do not go with them as they are.
@@ -43,15 +50,15 @@ def no_worse(
     Raises
     ------
     DesignError
-        If new parameters are slower, and the present ones do not keep the margin on all machines.
+        If new parameters are worse, and the present ones do not keep the margin on all machines.
     """
     present = task.present
     old = None if present is None else predicted(task, present, spread=False)
     if present is None or old is None or not old.stable:
         return chosen, kept
     good = [axis.margins.sensitivity_peak <= SLACK * task.most for axis in old.axes]
-    while slower := _slower_axes(task, chosen, old, good, kept):
-        kept |= slower
+    while worse := _worse_axes(task, chosen, old, good, kept):
+        kept |= worse
         mixed = tuple(present[k] if k in kept else one for k, one in enumerate(chosen))
         if not task.holds(mixed, kept):
             mixed = _round_these(task, mixed, kept) or present
@@ -59,7 +66,7 @@ def no_worse(
             every = frozenset(range(len(present)))
             if task.holds(present, every):
                 return present, every
-            raise _worse(task, chosen, old, min(slower))
+            raise _worse(task, chosen, old, min(worse))
         chosen = mixed
     return chosen, kept
 
@@ -80,7 +87,7 @@ def _round_these(
         return None
 
 
-def _slower_axes(
+def _worse_axes(
     task: Task,
     servos: tuple[Servo, ...],
     old: Prediction,
@@ -91,15 +98,30 @@ def _slower_axes(
     return frozenset(
         k
         for k, (one, was) in enumerate(zip(new.axes, old.axes, strict=True))
-        if good[k] and k not in kept and slower_than(one, was)
+        if good[k] and k not in kept
+        if slower_than(one, was) or (_stays_stiff(task, was) and softer_than(one, was))
     )
+
+
+def _stays_stiff(task: Task, was: AxisPrediction) -> bool:
+    """Whether neither the response nor its margin asks an axis to give up stiffness."""
+    return not task.softens and was.margins.sensitivity_peak <= SLACK * task.bound
 
 
 def _worse(task: Task, servos: tuple[Servo, ...], old: Prediction, axis: int) -> DesignError:
     new, was = predicted(task, servos, spread=False).axes[axis], old.axes[axis]
+    figures = (
+        f"would need {arrival(new):.3g} s for its typical move, the present ones need "
+        f"{arrival(was):.3g} s"
+    )
+    if not slower_than(new, was):
+        unit = unit_on(task.sides[axis].kind, "rad/(N m)")
+        figures = (
+            f"would let a torque or force move its motor by up to {new.compliance:.3g} {unit}, the "
+            f"present ones by {was.compliance:.3g} {unit}"
+        )
     return DesignError(
-        f"{new.axis}: the new parameters would need {arrival(new):.3g} s for its typical move, the "
-        f"present ones need {arrival(was):.3g} s with a peak of sensitivity of "
+        f"{new.axis}: the new parameters {figures} with a peak of sensitivity of "
         f"{was.margins.sensitivity_peak:.3g}, and do not keep {task.most:.3g} on every machine that "
         "the model allows; nothing is written. Keep the present ones, or try --response stiff."
     )
@@ -132,3 +154,8 @@ def slower_than(new: AxisPrediction, was: AxisPrediction) -> bool:
         arrival(new) > LONGER * arrival(was)
         or new.move.settling_time > LONGER * was.move.settling_time + TICK
     )
+
+
+def softer_than(new: AxisPrediction, was: AxisPrediction) -> bool:
+    """Return whether an axis gives way to torques clearly more than it did."""
+    return new.compliance > SOFTER * was.compliance

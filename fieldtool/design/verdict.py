@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from fieldtool.design.figures import strays
 from fieldtool.design.measured import AxisFigures, Sensitivity
 
 MARGIN = 1.05
@@ -19,8 +20,8 @@ SLOWER = 1.05
 CYCLES = 3.0
 """Cycles of the bus by which times may differ besides: no time is known better."""
 RINGS = 1.5
-"""Times the old vibration, and the old overshoot, or those that an identified model predicts, that the
-new ones may have; half the band about the target counts as nothing."""
+"""Times the old vibration, overshoot and following error, or those that an identified model predicts,
+that the new ones may have; half the band about the target counts as nothing."""
 LEAST_PEAK = 0.5
 """No loop's sensitivity stays below it over a band that reaches far above its bandwidth (Bode's
 integral): where it seems to, the torque that was told did not follow the excitation."""
@@ -170,7 +171,10 @@ def _worse(
             f"settles in {after.settling_time:.3g} s after its move, {before.settling_time:.3g} s with "
             f"the old parameters; {100 * (SLOWER - 1):.0f} % more is taken"
         )
-    for what, name in (("overshoots", "overshoot"), ("vibrates after its move", "vibration")):
+    kinds = [("overshoots", "overshoot"), ("vibrates after its move", "vibration")]
+    if believed:  # a design strays on purpose, and only a prediction tells how far
+        kinds.append(("leaves its reference", "following_error"))
+    for what, name in kinds:
         new, old = getattr(after, name), getattr(before, name)
         expected = getattr(one.predicted, name) if believed and one.predicted else 0.0
         if new > RINGS * max(old, expected) + one.band / 2:
@@ -207,6 +211,20 @@ def _unlike(one: Comparison, expected: AxisFigures, after: AxisFigures, cycle: f
                 "designed"
             )
     return found
+
+
+def strayed(one: Comparison) -> tuple[str, ...]:
+    """Return a sentence where an axis with new parameters that are kept strays farther than before."""
+    before, after = one.before, one.after
+    if before is None or after is None:
+        return ()
+    if not strays(after.following_error, before.following_error, one.band):
+        return ()
+    return (
+        f"{one.axis}: on its move it is up to {after.following_error:.3g} {one.unit} off its reference, "
+        f"{before.following_error:.3g} {one.unit} with the old parameters. Where the path counts for "
+        "more than the arrival, bring the old ones back: `fieldtool restore`.",
+    )
 
 
 def doubts(one: Comparison, cycle: float) -> tuple[str, ...]:

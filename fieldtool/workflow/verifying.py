@@ -26,7 +26,7 @@ from drives.parameters import Change
 from drives.parameters.journal import State
 from fieldtool.design.servo import Servo
 from fieldtool.design.tuning import SOFTEST, Tuning, why_not_stored
-from fieldtool.design.verdict import Comparison, doubts, faults
+from fieldtool.design.verdict import Comparison, doubts, faults, strayed
 from fieldtool.errors import (
     FieldtoolError,
     IdentificationError,
@@ -356,8 +356,10 @@ class Verification:
             for k, (one, before, after) in enumerate(self._histories)
         )
         cycle = self._planned.trial.cycle_time
-        kept = () if reasons or not self._believed else compared
-        doubtful = [text for one in kept for text in doubts(one, cycle)]
+        doubtful: list[str] = []
+        for one in () if reasons else compared:
+            doubtful += strayed(one)
+            doubtful += doubts(one, cycle) if self._believed else ()
         self.result = Verified(
             "restored" if reasons else "verified",
             reasons,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fieldtool.design.measured import AxisFigures, Sensitivity
-from fieldtool.design.verdict import Comparison, doubts, faults
+from fieldtool.design.verdict import Comparison, doubts, faults, strayed
 
 GOOD = AxisFigures(0.1, 0.5, 0.001, 0.01, 0.001, 1.0, 1.5, 10.0)
 FREQUENCY = np.array([5.0, 10.0, 20.0])
@@ -134,3 +134,30 @@ def test_only_a_prediction_that_is_believed_excuses_what_is_worse(name):
     assert len(found) == 1
     assert "0.4 rad, 0.001 rad with the old parameters" in found[0]
     assert found == told(predicted=None, after=after, believed=False)
+
+
+@pytest.mark.parametrize(
+    ("foretold", "error", "fault", "said"),
+    [
+        (0.01, 0.016, False, False),
+        (0.01, 0.018, False, True),
+        (0.01, 0.021, True, True),
+        (0.06, 0.08, False, True),
+        (0.06, 0.1, True, True),
+    ],
+)
+def test_a_path_that_is_left_farther_is_said_and_taken_back_where_nobody_foretold_it(
+    foretold, error, fault, said
+):
+    """0.01 rad with the old parameters, half the band is 0.005 rad."""
+    predicted, after = (replace(GOOD, following_error=value) for value in (foretold, error))
+    found = told(predicted=predicted, after=after)
+    assert len(found) == fault
+    if fault:
+        assert f"leaves its reference by {error:.3g} rad, 0.01 rad with the old" in found[0]
+    assert told(predicted=predicted, after=after, believed=False) == (), "it may be on purpose"
+    one = Comparison("x", "rad", 1.0, 0.5, 0.01, GOOD, predicted, after, None, CURVE, CURVE)
+    assert bool(strayed(one)) == said
+    if said:
+        assert f"up to {error:.3g} rad off its reference, 0.01 rad with the old" in strayed(one)[0]
+    assert strayed(replace(one, before=None)) == ()

@@ -1,0 +1,117 @@
+"""New parameters that are worse where settling does not show it: softer, or farther off the path."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fieldtool.design.design import Task
+from fieldtool.design.drive_side import DriveSide
+from fieldtool.design.figures import STRAYS, strays
+from fieldtool.design.given_up import given_up
+from fieldtool.design.machine import machine_of
+from fieldtool.design.moves import typical_move
+from fieldtool.design.no_worse import SOFTER, arrival, no_worse, predicted
+from fieldtool.design.predict import AxisPrediction
+from fieldtool.design.rule import DesignError
+from fieldtool.design.servo import Servo, Timing
+from fieldtool.design.start import slower
+from fieldtool.design.tuning import as_parameters
+from fieldtool.records.closed_loop import AxisLoop
+from fieldtool.records.model import AxisModel, Estimate, MachineModel
+
+MASS = 0.05
+PRESENT = Servo(AxisLoop(20.0, 4.0, 40.0, 1.0, MASS), timing=Timing(2e-3, 0.5e-3))
+"""Stiff, and its feed-forward leaves nothing to settle."""
+SOFT = slower(PRESENT, 0.6)
+
+
+def task_of(kind: str = "rotary", bound: float = 1.7) -> Task:
+    """A rigid axis whose drive holds PRESENT."""
+    model = MachineModel((AxisModel("x", kind, (Estimate(MASS, 0.0),), (), ()),))
+    side = DriveSide("x", None, PRESENT.timing, 10.0, 1e-6, {}, as_parameters(PRESENT), kind=kind)
+    move = typical_move("x", (-2.0, 2.0), 6.0, 60.0, 10.0, MASS)
+    rng = np.random.default_rng(1)
+    task = Task(model, (side,), (move,), bound, 1e3, [machine_of(model)], rng, lambda *_: None)
+    task.most = 2.0
+    return task
+
+
+def both(task: Task, new: Servo) -> tuple[AxisPrediction, AxisPrediction]:
+    now, was = (predicted(task, (one,), spread=False).axes[0] for one in (new, PRESENT))
+    assert now.margins.sensitivity_peak <= was.margins.sensitivity_peak < 1.7
+    assert arrival(now) <= 1.05 * arrival(was), "settling alone does not show it"
+    return now, was
+
+
+def test_an_axis_that_would_be_softer_for_nothing_keeps_its_own() -> None:
+    task = task_of()
+    new, was = both(task, SOFT)
+    assert new.compliance > SOFTER * was.compliance
+    assert no_worse(task, (SOFT,)) == ((PRESENT,), {0})
+    assert no_worse(task, (slower(PRESENT, 0.95),)) == ((slower(PRESENT, 0.95),), frozenset())
+
+
+def test_a_soft_response_and_a_margin_that_is_asked_for_may_take_stiffness() -> None:
+    task = task_of()
+    task.softens = True
+    assert no_worse(task, (SOFT,)) == ((SOFT,), frozenset())
+    peak = both(task, SOFT)[1].margins.sensitivity_peak
+    task = task_of(bound=peak / 1.05)
+    assert no_worse(task, (SOFT,)) == ((SOFT,), frozenset())
+
+
+def test_softer_ones_are_refused_by_that_name_where_the_present_ones_can_not_be_kept() -> None:
+    task = task_of()
+    light = MachineModel((AxisModel("x", "rotary", (Estimate(MASS / 8, 0.0),), (), ()),))
+    task.machines.append(machine_of(light))  # on which the present ones are too lively
+    with pytest.raises(
+        DesignError, match=r"x: the new .* move its motor by up to \S+ rad/\(N m\), "
+    ):
+        no_worse(task, (SOFT,))
+
+
+@pytest.mark.parametrize(
+    ("kind", "units"),
+    [("rotary", ("rad/(N m)", "N m/(rad s)")), ("linear", ("m/N", "N/(m s)"))],
+)
+def test_stiffness_that_is_given_up_is_said(kind: str, units: tuple[str, str]) -> None:
+    task = task_of(kind)
+    new, was = both(task, SOFT)
+    told = given_up(task.sides[0], new, was, (SOFT, PRESENT), "normal")
+    assert len(told) == 1
+    integral = SOFT.loop.position_p * SOFT.loop.velocity_i
+    assert f"by up to {new.compliance:.3g} {units[0]}, {was.compliance:.3g} {units[0]} " in told[0]
+    assert f"is {integral:.3g} {units[1]}, 800 {units[1]} with the present" in told[0]
+    assert told[0].endswith("try --response stiff.")
+    assert not given_up(task.sides[0], new, was, (SOFT, PRESENT), "stiff")[0].endswith("stiff.")
+    slow = replace(PRESENT, loop=replace(PRESENT.loop, velocity_i=40.0 / SOFTER / 1.01))
+    [only] = given_up(task.sides[0], was, was, (slow, PRESENT), "normal")
+    assert "by up to" not in only
+    for one in (PRESENT, slower(PRESENT, 0.95)):
+        assert given_up(task.sides[0], *both(task, one), (one, PRESENT), "normal") == []
+
+
+@pytest.mark.parametrize("factor", [0.99, 1.01])
+def test_a_path_that_is_left_farther_is_said(factor: float) -> None:
+    """From a fifth more, and half the band, on: the band is what nobody looks into."""
+    task = task_of()
+    _, was = both(task, PRESENT)
+    assert was.move is not None
+    was = replace(was, move=replace(was.move, following_error=0.1))
+    most = STRAYS * 0.1 + was.move.band / 2
+    far = replace(was, move=replace(was.move, following_error=factor * most))
+    told = given_up(task.sides[0], far, was, (PRESENT, PRESENT), "normal")
+    assert bool(told) == strays(factor * most, 0.1, was.move.band) == (factor > 1)
+    if told:
+        assert (
+            f"up to {factor * most:.3g} rad off its reference, 0.1 rad with the present" in told[0]
+        )
+
+
+def test_without_feed_forward_the_path_is_said_to_be_left() -> None:
+    task = task_of()
+    late = replace(PRESENT, loop=replace(PRESENT.loop, velocity_ff=0.7))
+    now, was = (predicted(task, (one,), spread=False).axes[0] for one in (late, PRESENT))
+    [told] = given_up(task.sides[0], now, was, (late, PRESENT), "stiff")
+    assert told.startswith("x: on its typical move the motor is up to ")
