@@ -12,6 +12,8 @@ GAINS = ("position_p", "velocity_p", "velocity_i")
 PID = ("pid_p", "pid_i", "pid_d")
 ABOVE_ZERO = ("position_p", "velocity_p", "pid_p", "pid_d")
 """Gains that no loop goes without: what rounds to 0 is one step of the drive's."""
+FEED_FORWARD = ("velocity_ff", "inertia_ff")
+"""That a design chooses."""
 FILTERS = (1, 2)
 CAUTIOUS = Timing()
 UNITS = {
@@ -22,6 +24,7 @@ UNITS = {
     "pid_i": "N m/(rad s)",
     "pid_d": "N m s/rad",
     "inertia_ff": "kg m2",
+    "viscous_ff": "N m s/rad",
     "velocity_filter": "Hz",
     **{f"filter{k}_frequency": "Hz" for k in FILTERS},
 }
@@ -119,6 +122,9 @@ class DriveSide:
     kind: Kind = "rotary"
     is_pid: bool = False
     """Whether the drive's loop is one PID, also where it is not known how it holds some of it."""
+    unused: Mapping[str, float | None] = field(default_factory=dict)
+    """Feed-forward that no design chooses and no prediction has: what the drive holds, in its own units;
+    None: not known.  It stays as it is."""
 
     def words(self, name: str, value: float) -> str:
         """Return a parameter's value with its unit."""

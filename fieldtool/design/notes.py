@@ -48,6 +48,28 @@ def drive_notes(
             f"{axis}: its drive profile has no {', '.join(side.missing)} that can be written; enter the "
             "numbers with the maker's software, or complete `parameters` in a drive profile of your own."
         )
+    notes += _unused(side)
     if side.unreadable:
         notes.append(f"{axis}: its present parameters can not be compared: {side.unreadable}")
+    return notes
+
+
+def _unused(side: DriveSide) -> list[str]:
+    """Return what feed-forward stays as it is, and whether predictions are right all the same."""
+    off = [name for name, value in side.unused.items() if value == 0]
+    notes = [
+        f"{side.axis}: {name} is 0 in the drive and stays so: a design does not use it."
+        for name in off
+    ]
+    present = side.present or {}
+    for name, value in side.unused.items():
+        if name in off:
+            continue
+        known = "not known" if value is None else f"{value:.6g} in the drive's own units"
+        held = side.words(name, present[name]) if name in present else known
+        notes.append(
+            f"{side.axis}: {name} ({held}) stays as it is in the drive: a design does not choose it, "
+            "and what is predicted of moves does not have it (margins do not depend on it). For moves "
+            "as predicted set it to 0 with the maker's software, and measure anew."
+        )
     return notes

@@ -16,7 +16,7 @@ from drives.parameters import DriveBackup, load_backup
 from drives.parameters.filters import filter_not_known
 from drives.profile import UNKNOWN, AxisProfile, DriveProfile, MachineProfile
 from drives.profile.eds import range_at, read_eds
-from fieldtool.design.drive_side import FILTERS, GAINS, DriveSide, Hold
+from fieldtool.design.drive_side import FEED_FORWARD, FILTERS, GAINS, DriveSide, Hold
 from fieldtool.design.moves import JERK_SHARE, SHORTEST_JERK, TestMove, typical_move
 from fieldtool.design.servo import CAUTIOUS_LAG, CAUTIOUS_PERIOD, Timing
 from fieldtool.records.model import MachineModel
@@ -130,7 +130,17 @@ def _side(axis: AxisProfile, machine: MachineProfile, kept: _Kept, cycle: float)
         why,
         axis.kind,
         profile.structure == "pid",
+        _unused(profile, kept),
     )
+
+
+def _unused(profile: DriveProfile, kept: _Kept) -> dict[str, float | None]:
+    """Return the feed-forward that no design chooses, and what the drive holds of it."""
+    return {
+        name: None if kept.backup is None else _held(kept.backup, profile.parameters[name].object)
+        for name in profile.feed_forward
+        if name not in FEED_FORWARD or name not in profile.tunable
+    }
 
 
 def _kept(folder: SessionFolder, machine: MachineProfile) -> dict[str, _Kept]:

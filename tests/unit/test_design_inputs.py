@@ -20,6 +20,8 @@ from drives.sim.faults import SdoRefused
 from drives.units import position_factor
 from fieldtool.cli.main import main
 from fieldtool.design.drive_side import GAINS, DriveSide
+from fieldtool.design.notes import drive_notes
+from fieldtool.design.predict import AxisPrediction
 from fieldtool.design.rule import DesignError
 from fieldtool.records.model_file import read_model, write_model
 from fieldtool.records.recording import save
@@ -210,6 +212,48 @@ def test_a_pid_that_no_cascade_is_can_not_be_compared(tmp_path: Path) -> None:
     side = drive_sides(folder, machine)[1]
     assert side.present is None
     assert "none that position P and velocity PI could be" in side.unreadable
+
+
+@pytest.mark.parametrize(
+    ("kind", "held", "said"),
+    [
+        ("epos4-dual-loop", {"0x30AE:22": 0}, {"viscous_ff is 0 in the drive and stays so"}),
+        (
+            "epos4-dual-loop",
+            {"0x30AE:22": 5000},
+            {"viscous_ff (0.0005 N m s/rad) stays as it is in the drive"},
+        ),
+        (
+            "epos4",
+            {"0x30A1:04": 0, "0x30A1:05": 77},
+            {
+                "viscous_ff is 0 in the drive and stays so",
+                "inertia_ff (77 in the drive's own units) stays as it is in the drive",
+            },
+        ),
+        ("reference", {}, set()),
+    ],
+)
+def test_feed_forward_that_no_design_chooses_is_said(
+    tmp_path: Path, kind: str, held: dict[str, int], said: set[str]
+) -> None:
+    """5000 uA s/rad at 0.1 N m/A.  Only what is not 0 makes moves differ from their prediction."""
+    folder = session(tmp_path, (kind, "reference"))
+    held_before(folder, 0, held)
+    side = drive_sides(folder, load_machine(folder.machine))[0]
+    assert side.present_servo is not None
+    none = AxisPrediction("table", None, None, None, None, 0.0, 0.0, 0.0)  # type: ignore[arg-type]
+    notes = [note for note in drive_notes(side, none, {}) if "_ff " in note]
+    assert {note.removeprefix("table: ").split(":")[0] for note in notes} == said
+    for note in notes:
+        assert ("does not have it" in note) == (" stays as it is " in note)
+
+
+def test_feed_forward_that_nobody_read_is_said(tmp_path: Path) -> None:
+    folder = session(tmp_path, ("epos4-dual-loop", "reference"), backup=False)
+    side = drive_sides(folder, load_machine(folder.machine))[0]
+    none = AxisPrediction("table", None, None, None, None, 0.0, 0.0, 0.0)  # type: ignore[arg-type]
+    assert any("viscous_ff (not known) stays as it is" in n for n in drive_notes(side, none, {}))
 
 
 @pytest.mark.parametrize("unit", [0xFA040300, 0x00040300])
