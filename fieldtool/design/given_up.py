@@ -66,7 +66,7 @@ def _stiffness(
     if before > SOFTER * integral:
         unit = unit_on(side.kind, UNITS["pid_i"])
         found.append(
-            "slow ones push it farther off: position_p times velocity_i, which works against them, is "
+            "slow forces push it farther off: position_p times velocity_i, which works against them, is "
             f"{integral:.3g} {unit}, {before:.3g} {unit} with the present parameters"
         )
     if not found:
