@@ -33,6 +33,9 @@ SHARE_OF_LIMIT = 0.25
 """And above this share of the limit."""
 UNEXPECTED = 3.0
 """While nothing repeats yet: larger by this than the peak that was predicted, instead of usual."""
+NEAR_LINES, NEAR_SHARE, MOSTLY = 4, 0.1, 0.7
+"""Lines beside that of an oscillation, or share of its frequency, that belong to it as it grows; and the
+share of the power above the band that they hold: of noise they do not."""
 _PADDING = 4
 
 
@@ -201,7 +204,9 @@ def _turns(values: FloatArray) -> int:
 
 
 def out_of_band(torque: FloatArray, highest: float) -> float | None:
-    """Return the frequency of a torque, shape (n,), most of whose power is above the band; else None.
+    """Return the frequency of a torque, shape (n,), that oscillates mostly above the band; else None.
+
+    Noise does not: no frequency holds most of what is above.
 
     Parameters
     ----------
@@ -219,6 +224,11 @@ def out_of_band(torque: FloatArray, highest: float) -> float | None:
     n = torque.size
     power = np.abs(np.fft.rfft((torque - torque.mean()) * np.hanning(n))) ** 2
     above = np.arange(power.size) / n > 1.2 * highest + 2 / n
-    if not np.any(above) or power[above].sum() < 0.5 * power.sum():
+    power_above = np.where(above, power, 0.0)
+    if not np.any(above) or power_above.sum() < 0.5 * power.sum():
         return None
-    return float(np.argmax(np.where(above, power, 0.0)) / n)
+    peak = int(np.argmax(power_above))
+    near = max(NEAR_LINES, round(NEAR_SHARE * peak))
+    if power_above[max(peak - near, 0) : peak + near + 1].sum() < MOSTLY * power_above.sum():
+        return None
+    return peak / n
