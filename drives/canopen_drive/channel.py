@@ -393,7 +393,7 @@ def channel_of(
             limits.torque,
             sum(drive.axis_profile.prior.masses),
             cycle_time,
-            drive.learned.pull * scale.torque,
+            None if drive.axis_profile.may_float else drive.learned.pull * scale.torque,
         ),
     )
 

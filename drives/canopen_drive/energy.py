@@ -27,8 +27,8 @@ FRICTION = 0.5
 """Share of the friction learned that is sure to be lost."""
 WEIGHT = 2.0
 """Times the torque that holds an axis which its weight, or a balancing spring, may come to."""
-FIRST = 20
-"""Samples in the beginning of a motion whose mean torque holds the axis."""
+FIRST, HOLDS = 20, 0.5
+"""Samples, and seconds, over which the mean torque may be what holds an axis against its weight."""
 RUN_UP = 0.01
 """Seconds in which the torque limit gives an axis from rest the energy that may be missing at the end,
 and that may be there in the beginning, from blows and old swings."""
@@ -50,7 +50,8 @@ class Balance:
     cycle_time
         s.
     weight
-        Torque that does not come from friction as far as is known, N m or N.
+        Torque that does not come from friction as far as is known, N m or N; None for an axis that
+        stays where it is without torque.
     """
 
     def __init__(
@@ -60,13 +61,13 @@ class Balance:
         torque: float,
         inertia: float,
         cycle_time: float,
-        weight: float = 0.0,
+        weight: float | None = None,
     ) -> None:
         self._position_unit, self._torque_unit = position_unit, torque_unit
         self._stays, self._lately = exp(-cycle_time / STAYS), exp(-cycle_time / LATELY)
         self._delay = DELAY / cycle_time
-        self._weight = abs(weight)
-        self._first: list[float] = []
+        self._weighs, self._weight = weight is not None, abs(weight or 0.0)
+        self._mean, self._samples, self._most = 0.0, 0, max(FIRST, round(HOLDS / cycle_time))
         self._before: tuple[int, float] | None = None
         self._low = self._high = 0
         self.spare = 0.5 * (torque * RUN_UP) ** 2 / inertia
@@ -93,16 +94,17 @@ class Balance:
         lost = FRICTION * friction * self._torque_unit * way
         self.brought = self._stays * self.brought + work + doubt - lost
         self.lately = self._lately * self.lately + work
-        if enabled:
+        if enabled and self._weighs:
             self._note_weight(now, position)
 
     def _note_weight(self, torque: float, position: int) -> None:
-        if not self._first:
+        if not self._samples:
             self._low = self._high = position
         self._low, self._high = min(self._low, position), max(self._high, position)
-        if len(self._first) < FIRST:
-            self._first.append(torque)
-            self._weight = max(self._weight, abs(sum(self._first)) / FIRST)
+        self._samples += 1
+        self._mean += (torque - self._mean) / min(self._samples, self._most)
+        if self._samples >= FIRST:
+            self._weight = max(self._weight, abs(self._mean))
 
     @property
     def stored(self) -> float:

@@ -31,7 +31,7 @@ class FakeDrive:
 
     @property
     def axis_profile(self):
-        return SimpleNamespace(prior=SimpleNamespace(masses=(0.02,), springs=()))
+        return SimpleNamespace(prior=SimpleNamespace(masses=(0.02,), springs=()), may_float=False)
 
 
 def channel(name="x", rated=4.0, limit=6.0, takes_offset=True):
