@@ -180,8 +180,7 @@ class Channel:
 
     def _judge_unseen(self, torque: int, cycles: float) -> None:
         enabled = self.statusword & ENABLED_MASK == ENABLED_VALUE
-        friction = self.drive.learned.friction
-        self.balance.take(self.position, torque, cycles, friction, enabled=enabled)
+        self.balance.take(self.position, torque, cycles, enabled=enabled)
         if self.unseen is None:
             return
         if not enabled:
@@ -336,7 +335,7 @@ class Channel:
         return (
             f"{drive.axis}: moves the wrong way: the axes give back more energy than they were given, "
             f"so its motor turns against its torque (now {torque:.3g} {drive.torque_unit}), or "
-            "something moves it; its power was cut and all axes were stopped. If nothing touched it, "
+            "something moves it; all axes were stopped. If nothing touched it, "
             "check the motor's phases and the encoder's direction."
         )
 

@@ -15,7 +15,8 @@ from collections.abc import Sequence
 from math import exp
 
 STAYS = 1.0
-"""Seconds after which a share of 1 / e is left of an energy: of a swing of 8 Hz with 1 % of damping."""
+"""Seconds after which a share of 1 / e is left of an energy that no motion of motors holds: of a load's
+swing of 8 Hz with 1 % of damping."""
 DELAY = 0.003
 """Seconds by which position and torque may be told apart (filters, delays): it turns work done into work
 given back, where both change fast."""
@@ -23,8 +24,8 @@ SCALE = 0.1
 """Share by which a torque may be told wrong, against that of another axis."""
 ROUNDING = 0.25
 """Position units that a position is beside the true one, when the torque changes."""
-FRICTION = 0.5
-"""Share of the friction learned that is sure to be lost."""
+MOVES = 2.0
+"""Times the energy of motion by the prior model which a moving axis may hold: that does not fade."""
 WEIGHT = 2.0
 """Times the torque that holds an axis which its weight, or a balancing spring, may come to."""
 FIRST, HOLDS = 20, 0.5
@@ -33,7 +34,7 @@ RUN_UP = 0.01
 """Seconds in which the torque limit gives an axis from rest the energy that may be missing at the end,
 and that may be there in the beginning, from blows and old swings."""
 LATELY = 0.1
-"""Seconds over which it is judged which axis gave back most."""
+"""Seconds over which it is judged which axis gave back most, and how fast one is that swings."""
 
 
 class Balance:
@@ -65,7 +66,8 @@ class Balance:
     ) -> None:
         self._position_unit, self._torque_unit = position_unit, torque_unit
         self._stays, self._lately = exp(-cycle_time / STAYS), exp(-cycle_time / LATELY)
-        self._delay = DELAY / cycle_time
+        self._delay, self._cycle_time, self._inertia = DELAY / cycle_time, cycle_time, inertia
+        self._speed = 0.0
         self._weighs, self._weight = weight is not None, abs(weight or 0.0)
         self._mean, self._samples, self._most = 0.0, 0, max(FIRST, round(HOLDS / cycle_time))
         self._before: tuple[int, float] | None = None
@@ -77,9 +79,7 @@ class Balance:
         self.lately = 0.0
         """What it has brought in lately, nothing in its favour."""
 
-    def take(
-        self, position: int, torque: int, cycles: float, friction: float, *, enabled: bool
-    ) -> None:
+    def take(self, position: int, torque: int, cycles: float, *, enabled: bool) -> None:
         """Take the next sample, in units, so many cycles after the one before."""
         now = torque * self._torque_unit if enabled else 0.0
         place, before = self._before or (position, now)
@@ -91,8 +91,9 @@ class Balance:
         )
         if cycles != 1.0:
             doubt += (abs(before) + abs(now)) * way
-        lost = FRICTION * friction * self._torque_unit * way
-        self.brought = self._stays * self.brought + work + doubt - lost
+        self._speed = max(way / (self._cycle_time * cycles), self._lately * self._speed)
+        moves = min(max(self.brought, 0.0), MOVES * 0.5 * self._inertia * self._speed**2)
+        self.brought = moves + self._stays * (self.brought - moves) + work + doubt
         self.lately = self._lately * self.lately + work
         if enabled and self._weighs:
             self._note_weight(now, position)

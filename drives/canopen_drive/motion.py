@@ -667,12 +667,13 @@ class CanopenMotion:
         """Raise SafetyStopError where the axes give back more energy than they were given."""
         worst = reversed_axis([c.balance for c in self._channels])
         if worst is not None:
-            channel = self._channels[worst]
+            drive = self._channels[worst].drive
             raise SafetyStopError(
-                channel.reversed_words(),
-                axis=channel.drive.axis,
+                self._channels[worst].reversed_words(),
+                axis=drive.axis,
                 cycle=self._count - 1,
-                runaway=True,
+                # an axis that may sink is held, if it can be: one that runs away loses its power then
+                runaway=drive.axis_profile.may_float,
             )
 
     def _look(self, targets: Sequence[int], offsets: Sequence[int]) -> None:

@@ -52,7 +52,7 @@ class Hold:
         """Return how it is held while those parameters are so; anything where one is not known or 0."""
         if not self.times:
             return self
-        if any(name not in others for name in self.times):
+        if any(not others.get(name) for name in self.times):
             return Hold()
         scale = self.scale * prod(others[name] ** power for name, power in self.times.items())
         return replace(self, scale=scale, times={}) if isfinite(scale) and scale > 0 else Hold()
@@ -281,4 +281,4 @@ class DriveSide:
             return None
         if not all(isfinite(present[n]) for n in GAINS):
             return None
-        return servo_from_parameters(present, self.timing)
+        return self.servo({})

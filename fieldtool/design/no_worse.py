@@ -56,8 +56,10 @@ def no_worse(
     old = None if present is None else predicted(task, present, spread=False)
     if present is None or old is None or not old.stable:
         return chosen, kept
-    good = [axis.margins.sensitivity_peak <= SLACK * task.most for axis in old.axes]
-    while worse := _worse_axes(task, chosen, old, good, kept):
+    peaks = [axis.margins.sensitivity_peak for axis in old.axes]
+    good = [peak <= SLACK * task.most for peak in peaks]
+    stiff = [_stays_stiff(task, present) and peak <= SLACK * task.bound for peak in peaks]
+    while worse := _worse_axes(task, chosen, old, (good, stiff), kept):
         kept |= worse
         mixed = tuple(present[k] if k in kept else one for k, one in enumerate(chosen))
         if not task.holds(mixed, kept):
@@ -91,21 +93,22 @@ def _worse_axes(
     task: Task,
     servos: tuple[Servo, ...],
     old: Prediction,
-    good: list[bool],
+    which: tuple[list[bool], list[bool]],
     kept: frozenset[int],
 ) -> frozenset[int]:
-    new = predicted(task, servos, spread=False)
+    """Return the axes that would be worse, of those whose present loops count, and as how stiff."""
+    new, (good, stiff) = predicted(task, servos, spread=False), which
     return frozenset(
         k
         for k, (one, was) in enumerate(zip(new.axes, old.axes, strict=True))
         if good[k] and k not in kept
-        if slower_than(one, was) or (_stays_stiff(task, was) and softer_than(one, was))
+        if slower_than(one, was) or (stiff[k] and softer_than(one, was))
     )
 
 
-def _stays_stiff(task: Task, was: AxisPrediction) -> bool:
-    """Whether neither the response nor its margin asks an axis to give up stiffness."""
-    return not task.softens and was.margins.sensitivity_peak <= SLACK * task.bound
+def _stays_stiff(task: Task, present: tuple[Servo, ...]) -> bool:
+    """Whether nothing asks to give up stiffness: no response, and no machine that the model allows."""
+    return not task.softens and task.holds(present, frozenset(range(len(present))))
 
 
 def _worse(task: Task, servos: tuple[Servo, ...], old: Prediction, axis: int) -> DesignError:

@@ -123,6 +123,9 @@ def test_a_pid_stays_one_where_the_unit_of_its_integral_is_not_known() -> None:
     p, i, d = pid_of(side.held({"position_p": 4.0, "velocity_p": 0.004, "velocity_i": 0.016}))
     assert i == pytest.approx(p * p / (4 * d), rel=2e-3), "no cascade has more"
     assert DriveSide("x").servo(held).loop.velocity_ff == 0.0
+    given = DriveSide("x", present=dict(held) | {"velocity_ff": 0.0}, is_pid=True).present_servo
+    assert given is not None
+    assert given.loop.velocity_ff == 1.0, "a PID feeds the whole velocity forward now, too"
 
 
 @given(st.floats(0.02, 5.0), st.floats(0.1, 50.0), st.floats(0.1, 3.0))
@@ -156,6 +159,7 @@ def test_a_gain_is_rounded_beside_what_its_scale_goes_with_became(velocity, posi
 
 def test_what_a_scale_goes_with_and_nobody_knows_holds_anything() -> None:
     hold = Hold(0.05, whole=True, low=0, high=10, times={"velocity_p": 1})
+    assert Hold(0.05, whole=True, times={"velocity_p": -1}).beside({"velocity_p": 0.0}) == Hold()
     side = DriveSide("x", holds={"velocity_i": hold})
     assert side.held({"velocity_i": 1.2345})["velocity_i"] == 1.2345
     assert side.held({"velocity_p": 2.0, "velocity_i": 1.2345})["velocity_i"] == pytest.approx(1.0)
