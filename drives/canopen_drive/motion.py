@@ -235,6 +235,7 @@ class CanopenMotion:
                 self._look(self._held_targets(), [0] * len(self._channels))
             for channel in self._channels:
                 self._check_enabling(channel)
+            self._check_energy()
             if all(c.state is PowerState.OPERATION_ENABLED for c in self._channels):
                 return
 

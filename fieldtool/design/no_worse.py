@@ -8,7 +8,6 @@ from math import inf
 
 import numpy as np
 
-from drives.units import unit_on
 from fieldtool.design.design import Task, improved
 from fieldtool.design.held import held
 from fieldtool.design.machine import machine_of
@@ -113,18 +112,9 @@ def _stays_stiff(task: Task, present: tuple[Servo, ...]) -> bool:
 
 def _worse(task: Task, servos: tuple[Servo, ...], old: Prediction, axis: int) -> DesignError:
     new, was = predicted(task, servos, spread=False).axes[axis], old.axes[axis]
-    figures = (
-        f"would need {arrival(new):.3g} s for its typical move, the present ones need "
-        f"{arrival(was):.3g} s"
-    )
-    if not slower_than(new, was):
-        unit = unit_on(task.sides[axis].kind, "rad/(N m)")
-        figures = (
-            f"would let a torque or force move its motor by up to {new.compliance:.3g} {unit}, the "
-            f"present ones by {was.compliance:.3g} {unit}"
-        )
     return DesignError(
-        f"{new.axis}: the new parameters {figures} with a peak of sensitivity of "
+        f"{new.axis}: the new parameters would need {arrival(new):.3g} s for its typical move, the "
+        f"present ones need {arrival(was):.3g} s with a peak of sensitivity of "
         f"{was.margins.sensitivity_peak:.3g}, and do not keep {task.most:.3g} on every machine that "
         "the model allows; nothing is written. Keep the present ones, or try --response stiff."
     )

@@ -13,7 +13,6 @@ from fieldtool.design.machine import machine_of
 from fieldtool.design.moves import typical_move
 from fieldtool.design.no_worse import SOFTER, arrival, no_worse, predicted
 from fieldtool.design.predict import AxisPrediction
-from fieldtool.design.rule import DesignError
 from fieldtool.design.servo import Servo, Timing
 from fieldtool.design.start import slower
 from fieldtool.design.tuning import as_parameters
@@ -61,14 +60,12 @@ def test_a_soft_response_and_a_margin_that_is_asked_for_may_take_stiffness() -> 
     assert no_worse(task, (SOFT,)) == ((SOFT,), frozenset())
 
 
-def test_softer_ones_are_refused_by_that_name_where_the_present_ones_can_not_be_kept() -> None:
+def test_softer_ones_are_taken_where_the_present_ones_do_not_hold_on_every_machine() -> None:
+    """They are what keeps the margin there: what is given up for that is only said."""
     task = task_of()
     light = MachineModel((AxisModel("x", "rotary", (Estimate(MASS / 8, 0.0),), (), ()),))
     task.machines.append(machine_of(light))  # on which the present ones are too lively
-    with pytest.raises(
-        DesignError, match=r"x: the new .* move its motor by up to \S+ rad/\(N m\), "
-    ):
-        no_worse(task, (SOFT,))
+    assert no_worse(task, (SOFT,)) == ((SOFT,), frozenset())
 
 
 @pytest.mark.parametrize(
