@@ -14,6 +14,7 @@ import yaml
 from drives.profile import load_machine
 from fieldtool import workflow
 from fieldtool.criticise.criticise import criticise
+from fieldtool.errors import IdentificationError
 from tests.hidden.hiding import MAKERS, OF_TWO, draw
 from tests.hidden.scoring import cause_of, is_of, numbers, tie_with
 from tests.session.conftest import one_axis
@@ -89,7 +90,12 @@ def test_the_whole_tool_finds_it_over_the_bus(tmp_path, fresh_rng):
     machine["bus"]["channel"] = str(path)
     path.write_text(yaml.safe_dump(machine), encoding="utf-8")
     workflow.measure(load_machine(path), tmp_path / "session")
-    workflow.identify(tmp_path / "session")
+    try:
+        workflow.identify(tmp_path / "session")
+    except IdentificationError as error:  # cut off so far that no machine is left in the data
+        assert part["effect"] == "torque_saturation"
+        assert "gives less torque than its drive tells" in " ".join(error.__notes__)
+        return
     criticism = workflow.criticise(tmp_path / "session").criticism
     first = criticism.causes[0]
     assert first.effect == part["effect"] or part["effect"] in {t.effect for t in first.ties}

@@ -169,9 +169,11 @@ def _told_of_distortion(measured: JointResult) -> Iterator[None]:
         if seen:
             error.add_note(
                 f"The data are strongly non-linear, which may be the cause: distortion of "
-                f"{', '.join(dict.fromkeys(seen))}, likely dry friction or backlash. Give the numbers "
-                "of masses with --masses AXIS=N (dry friction is then taken off), or measure with a "
-                "larger amplitude or on top of a constant velocity, and check the axis for play."
+                f"{', '.join(dict.fromkeys(seen))}. Dry friction: give the numbers of masses with "
+                "--masses AXIS=N (it is then taken off). Backlash: measure with a larger amplitude or "
+                "on top of a constant velocity. A motor that gives less torque than its drive tells "
+                "(current limit, supply): lower the axis' torque limit in the machine profile, and "
+                "measure again."
             )
         raise
 
