@@ -90,11 +90,14 @@ def test_the_whole_tool_finds_it_over_the_bus(tmp_path, fresh_rng):
     machine["bus"]["channel"] = str(path)
     path.write_text(yaml.safe_dump(machine), encoding="utf-8")
     workflow.measure(load_machine(path), tmp_path / "session")
+    told = ""
     try:
         workflow.identify(tmp_path / "session")
     except IdentificationError as error:  # cut off so far that no machine is left in the data
+        told = " ".join(error.__notes__)
+    if told:
         assert part["effect"] == "torque_saturation"
-        assert "gives less torque than its drive tells" in " ".join(error.__notes__)
+        assert "gives less torque than its drive tells" in told
         return
     criticism = workflow.criticise(tmp_path / "session").criticism
     first = criticism.causes[0]
