@@ -245,7 +245,8 @@ def _described(profile: "MachineProfile") -> SimulatedMachine:
         if axis.kind == "linear":
             if axis.feed is None:
                 raise ValueError(
-                    f"axis {axis.name} is linear and needs `feed`, metres a revolution"
+                    f"axis {axis.name} is linear: to be simulated it needs `feed` under `axes`, the "
+                    "metres that it goes in a revolution, as a number"
                 )
             counts_per_metre = truth.encoder_counts_per_rev / axis.feed
         serial = axis.serial_number

@@ -104,7 +104,7 @@ def _tables(tuning: Tuning, width: int) -> list[Sheet]:
 def _table(tuning: Tuning, axes: Sequence[AxisPrediction]) -> Sheet:
     """Return present and predicted figures of some axes."""
     now = tuning.present
-    titles = [title for a in axes for title in ((f"{a.axis} now", "new") if now else (a.axis,))]
+    titles = [title for a in axes for title in ((f"{a.axis} before", "new") if now else (a.axis,))]
     table = Sheet("predicted (SI)", *titles, numbers=titles)
     for title, scale, of in ROWS:
         shown = [one for axis in axes for one in ((now.of(axis.axis), axis) if now else (axis,))]

@@ -71,5 +71,9 @@ def _stiffness(
         )
     if not found:
         return []
-    other = "" if response == STIFFEST else f" Where that matters, try --response {STIFFEST}."
+    other = (
+        ""
+        if response == STIFFEST
+        else (f" Where that matters, compare --response {STIFFEST}, or keep the present ones.")
+    )
     return [f"{side.axis}: gives up stiffness: {'; '.join(found)}.{other}"]

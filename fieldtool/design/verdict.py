@@ -223,7 +223,7 @@ def strayed(one: Comparison) -> tuple[str, ...]:
     return (
         f"{one.axis}: on its move it is up to {after.following_error:.3g} {one.unit} off its reference, "
         f"{before.following_error:.3g} {one.unit} with the old parameters. Where the path counts for "
-        "more than the arrival, bring the old ones back: `fieldtool restore`.",
+        "more than the arrival, bring the old ones back: `fieldtool restore` with the session's folder.",
     )
 
 

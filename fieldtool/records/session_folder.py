@@ -33,8 +33,8 @@ class SessionFolder:
                 probe.unlink(missing_ok=True)
         except OSError as error:
             raise OutputError(
-                f"{path}: results can not be written here ({error.strerror}). Choose another folder "
-                "with --out. Nothing was moved."
+                f"{path}: results can not be written here ({error.strerror}). Make it "
+                "writable, or choose another folder (--out). Nothing was moved."
             ) from error
         return cls(path)
 

@@ -53,6 +53,8 @@ def parameters(material: Material) -> Section | None:
             "list",
         )
     )
+    if material.tuning.notes:
+        blocks.append(Words(tuple(material.tuning.notes), "list"))
     return Section("Controller parameters", _state(material), tuple(blocks))
 
 
@@ -89,6 +91,13 @@ def _state(material: Material) -> str:
         return "Designed; whether they were written is not known: there is no log."
     if not written:
         return "Designed; nothing was written into the drives."
+    last = [e for e in material.events if e in written or e.get("event") == "restored"][-1]
+    if last.get("event") == "restored":
+        but = ", ".join(str(axis) for axis in last.get("without") or ())
+        return (
+            "Written into the drives and read back; afterwards the old ones were brought back "
+            f"(`fieldtool restore`){f', but for {but}' if but else ''}."
+        )
     if written[-1].get("stored"):
         return "Written into the drives, read back, and stored in their non-volatile memory."
     return (

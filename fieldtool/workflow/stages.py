@@ -310,7 +310,7 @@ def restore(
         screen.say(f"{simulated} {BEGIN_ANEW}")
     with connected(profile, trace=trace, to_move=False) as group:
         screen.stage("Bring the old parameters back")
-        return bring_back(
+        restored = bring_back(
             profile.name,
             group.drives,
             source,
@@ -319,6 +319,9 @@ def restore(
             without=without,
             say=screen.say,
         )
+    if backup.is_dir():
+        SessionFolder(backup).note("restored", stored=store, without=sorted(without))
+    return restored
 
 
 def _rescued(folder: SessionFolder, screen: Screen) -> None:

@@ -11,6 +11,7 @@ from fieldtool.design.moves import TestMove
 from fieldtool.design.predict import AxisPrediction, Prediction
 from fieldtool.errors import PlanRefusedError
 from fieldtool.experiment.forecast import Setting
+from fieldtool.experiment.verification.steps import PUSHED_ERROR
 from fieldtool.experiment.verification.swings import Swings
 from fieldtool.experiment.verification.trial import TrialMove
 from fieldtool.records.model import AxisModel, FloatArray
@@ -20,7 +21,8 @@ ROOM = 0.6
 FEWEST_COUNTS, BAND_COUNTS = 100.0, 4.0
 """Counts of the encoder that a move, and the band about its target, have at least."""
 KEPT = 0.85
-"""Of the limits of torque, velocity and following error that a move may take by prediction."""
+"""Of the limits of torque, velocity and following error that a move may take by prediction; of what an
+axis may be pushed that does not move itself, too."""
 SWELLS, BESIDE = 1.6, 0.15
 """Times the predicted torque, and share of the limit besides, that a move may take; never more than
 MOST of the limit, and OTHERS of it on axes that are not moved."""
@@ -118,6 +120,8 @@ def _shares(
         ("velocity", f"{length}/s"),
     ):
         value, most = getattr(taken, name), KEPT * getattr(limits, name)
+        if while_moving and name == "following_error":
+            most *= PUSHED_ERROR
         yield (
             value / most,
             f"{own.name}: {name.replace('_', ' ')} {value:.3g} {unit}{while_moving}, {most:.3g} "

@@ -155,8 +155,9 @@ class Verification:
                 error.add_note(
                     "That was with the parameters that are in the drives now, in a trial before "
                     "anything was written; nothing was. If the axis swings, lower its gains by hand "
-                    "(velocity_i, then position_p and velocity_p); if it sags as it is enabled, raise "
-                    "velocity_i and position_p. Then measure and design anew: `fieldtool run`."
+                    "(velocity_i, then position_p and velocity_p); if it sags as it is enabled, or "
+                    "another one pushes it away, raise velocity_i and position_p. Then measure and "
+                    "design anew: `fieldtool run`."
                 )
                 raise
 

@@ -162,6 +162,8 @@ def test_a_disk_that_fills_up_in_the_middle_takes_everything_back(session):
     assert "run `fieldtool restore` once" in outcome.err, "the journal could not be closed"
     part.rmdir()
     assert session.command("restore", session.out).code == 0
+    last = json.loads((session.out / "events.jsonl").read_text().splitlines()[-1])
+    assert last["event"] == "restored"
     assert notes() == []
 
 

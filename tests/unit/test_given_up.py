@@ -80,8 +80,10 @@ def test_stiffness_that_is_given_up_is_said(kind: str, units: tuple[str, str]) -
     integral = SOFT.loop.position_p * SOFT.loop.velocity_i
     assert f"by up to {new.compliance:.3g} {units[0]}, {was.compliance:.3g} {units[0]} " in told[0]
     assert f"is {integral:.3g} {units[1]}, 800 {units[1]} with the present" in told[0]
-    assert told[0].endswith("try --response stiff.")
-    assert not given_up(task.sides[0], new, was, (SOFT, PRESENT), "stiff")[0].endswith("stiff.")
+    assert told[0].endswith("compare --response stiff, or keep the present ones.")
+    assert not given_up(task.sides[0], new, was, (SOFT, PRESENT), "stiff")[0].endswith(
+        "present ones."
+    )
     slow = replace(PRESENT, loop=replace(PRESENT.loop, velocity_i=40.0 / SOFTER / 1.01))
     [only] = given_up(task.sides[0], was, was, (slow, PRESENT), "normal")
     assert "by up to" not in only

@@ -461,6 +461,14 @@ def test_what_was_written_is_told_from_what_was_designed_or_tried_later():
     assert table.rows[0][3] == "3.1"
     assert "were not written" in warning.sentences[0]
     assert section.lead.startswith("Written into the drives")
+    back = [*later, {"event": "restored", "without": ["arm"]}]
+    section = parameters(Material("x", tuning=tuning, events=tuple(back)))
+    assert section.lead.endswith("old ones were brought back (`fieldtool restore`), but for arm.")
+    section = parameters(Material("x", tuning=tuning, events=(*back, later[2])))
+    assert "not stored" in section.lead, "written once more"
+    told = replace(tuning, notes=("table: gives up stiffness.",))
+    section = parameters(Material("x", tuning=told, events=tuple(later)))
+    assert section.blocks[-1].sentences == told.notes
     section = parameters(Material("x", tuning=tuning, events=tuple(later[3:])))
     table, _ = section.blocks
     assert table.rows[0][3] == "4.2"

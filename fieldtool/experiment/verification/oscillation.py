@@ -352,10 +352,13 @@ class OscillationWatch:
         swung = self._positions[k].take(position)
         unit, torque_unit = self._units[k]
         if not allowed.low[k] <= position <= allowed.high[k]:
+            others = allowed.moving not in (None, k)
             sags = ", or it sags under its load" if allowed.resting else ""
+            sags += ", or the axis that moves pushes it away" if others else ""
             return (
                 f"is at {position:.5g} {unit}, outside of {allowed.low[k]:.5g} to "
-                f"{allowed.high[k]:.5g} {unit} where it has to stay: its loop runs away or swings{sags}"
+                f"{allowed.high[k]:.5g} {unit} where it has to stay: its loop runs away or "
+                f"swings{sags}"
             )
         push = torque - (self._rest[k] if self._rest else torque)
         if abs(push) > allowed.torque[k]:
