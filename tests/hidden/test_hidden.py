@@ -24,9 +24,13 @@ CLEAR = 40.0
 KINDS = (
     {"effect": "coulomb_friction", "torque": (0.1, 0.3)},
     {"effect": "cogging", "torque": (0.1, 0.3), "periods": 24},
-    {"effect": "torque_saturation", "torque": (1.0, 1.5)},
+    {"effect": "torque_saturation", "torque": (1.8, 2.0)},
 )
-"""Effects of a profile, with ranges of their size, N m."""
+"""Effects of a profile, with ranges of their size, N m.
+
+A motor that is cut off at less winds its loop up to the torque limit, and the measurement is stopped; at
+more, the plan's torques are hardly cut off.
+"""
 
 
 def found(seed, effect):
