@@ -152,7 +152,9 @@ class Channel:
         self._judge_jump()
         cycles = 1 + self.missing + self.paused
         self._note_shaking(cycles)
-        self._judge_unseen(torque, cycles)
+        enabled = self.statusword & ENABLED_MASK == ENABLED_VALUE
+        self.balance.take(self.position, torque, cycles, enabled=enabled)
+        self._judge_unseen(torque, cycles, enabled)
         self.allowed = ceil(self.step * cycles)
         self._judge_span(cycles)
         self.missing, self.paused = 0, 0.0
@@ -178,9 +180,7 @@ class Channel:
             sure = max(0, abs(change) - SHAKEN_UNITS) / SHAKEN_CYCLES**2
             self.shaken = max(self.shaken, sure)
 
-    def _judge_unseen(self, torque: int, cycles: float) -> None:
-        enabled = self.statusword & ENABLED_MASK == ENABLED_VALUE
-        self.balance.take(self.position, torque, cycles, enabled=enabled)
+    def _judge_unseen(self, torque: int, cycles: float, enabled: bool) -> None:
         if self.unseen is None:
             return
         if not enabled:

@@ -57,14 +57,16 @@ def no_worse(
         return chosen, kept
     peaks = [axis.margins.sensitivity_peak for axis in old.axes]
     good = [peak <= SLACK * task.most for peak in peaks]
-    stiff = [_stays_stiff(task, present) and peak <= SLACK * task.bound for peak in peaks]
+    every = frozenset(range(len(present)))
+    # no response asks to give up stiffness, and no machine that the model allows
+    firm = not task.softens and task.holds(present, every)
+    stiff = [firm and peak <= SLACK * task.bound for peak in peaks]
     while worse := _worse_axes(task, chosen, old, (good, stiff), kept):
         kept |= worse
         mixed = tuple(present[k] if k in kept else one for k, one in enumerate(chosen))
         if not task.holds(mixed, kept):
             mixed = _round_these(task, mixed, kept) or present
         if mixed == present:
-            every = frozenset(range(len(present)))
             if task.holds(present, every):
                 return present, every
             raise _worse(task, chosen, old, min(worse))
@@ -103,11 +105,6 @@ def _worse_axes(
         if good[k] and k not in kept
         if slower_than(one, was) or (stiff[k] and softer_than(one, was))
     )
-
-
-def _stays_stiff(task: Task, present: tuple[Servo, ...]) -> bool:
-    """Whether nothing asks to give up stiffness: no response, and no machine that the model allows."""
-    return not task.softens and task.holds(present, frozenset(range(len(present))))
 
 
 def _worse(task: Task, servos: tuple[Servo, ...], old: Prediction, axis: int) -> DesignError:
