@@ -93,7 +93,8 @@ def _state(material: Material) -> str:
         return "Designed; nothing was written into the drives."
     last = [e for e in material.events if e in written or e.get("event") == "restored"][-1]
     if last.get("event") == "restored":
-        but = ", ".join(str(axis) for axis in last.get("without") or ())
+        without = last.get("without")
+        but = ", ".join(map(str, without)) if isinstance(without, list) else ""
         return (
             "Written into the drives and read back; afterwards the old ones were brought back "
             f"(`fieldtool restore`){f', but for {but}' if but else ''}."

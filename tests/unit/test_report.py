@@ -464,6 +464,9 @@ def test_what_was_written_is_told_from_what_was_designed_or_tried_later():
     back = [*later, {"event": "restored", "without": ["arm"]}]
     section = parameters(Material("x", tuning=tuning, events=tuple(back)))
     assert section.lead.endswith("old ones were brought back (`fieldtool restore`), but for arm.")
+    back[-1]["without"] = 7  # a log that was edited costs a name, and no report
+    section = parameters(Material("x", tuning=tuning, events=tuple(back)))
+    assert section.lead.endswith("brought back (`fieldtool restore`).")
     section = parameters(Material("x", tuning=tuning, events=(*back, later[2])))
     assert "not stored" in section.lead, "written once more"
     told = replace(tuning, notes=("table: gives up stiffness.",))
