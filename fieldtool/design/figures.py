@@ -11,6 +11,9 @@ from fieldtool.records.model import FloatArray
 ComplexArray = NDArray[np.complexfloating[Any, Any]]
 STEP_BAND = 0.02
 """Of a step's height: within it the step has settled."""
+SHORTEST_WATCH, LONGEST_WATCH = 0.5, 6.0
+"""s: a move's vibration is that of as much time after its reference as this took, within these bounds:
+records of any length, measured or predicted, compare."""
 STRAYS = 1.2
 """Times a following error, and half the band about the target: one above is clearly larger."""
 CREEPS = 24
@@ -34,7 +37,7 @@ class MoveFigures:
     following_error: float
     """Largest distance from the reference, from its beginning to the end of the record."""
     residual_peak: float
-    """Largest deviation of the oscillating part after the reference has ended."""
+    """Largest deviation of the oscillating part after the reference has ended; see :func:`watched`."""
     residual_rms: float
     """RMS of that part."""
     band: float
@@ -69,8 +72,8 @@ def move_figures(
     Parameters
     ----------
     time
-        s, shape (n,), ascending; the record should go on for several periods of the slowest
-        oscillation after the reference has ended.
+        s, shape (n,), ascending; the record should go on after the reference has ended for several
+        periods of the slowest oscillation, and for what :func:`watched` returns.
     reference, position
         Of the same axis at these times, shape (n,), rad or m; a delay of the measurement that is
         known should be taken out first.
@@ -93,8 +96,9 @@ def move_figures(
     target, way = float(reference[-1]), float(reference[-1] - reference[0])
     beyond = (position - target) * np.sign(way if way else 1.0)
     arrived = last_outside(time, position - target, band)
-    left = (position - target)[end:]
-    swing = oscillation(time[end:], left)
+    seen = time <= time[end] + watched(float(time[end] - time[begin]))
+    seen[:end] = False
+    swing = oscillation(time[seen], (position - target)[seen])
     return MoveFigures(
         settling_time=max(arrived - float(time[end]), 0.0),
         positioning_time=max(arrived - float(time[begin]), 0.0),
@@ -104,6 +108,11 @@ def move_figures(
         residual_rms=float(np.sqrt(np.mean(swing**2))),
         band=band,
     )
+
+
+def watched(duration: float) -> float:
+    """Return how long after a move of this duration its vibration is looked at, s."""
+    return min(max(duration, SHORTEST_WATCH), LONGEST_WATCH)
 
 
 def strays(new: float, was: float, band: float) -> bool:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fieldtool.design.dragged import dragged, rubbing
-from fieldtool.design.figures import MoveFigures, StepFigures, move_figures, step_figures
+from fieldtool.design.figures import MoveFigures, StepFigures, move_figures, step_figures, watched
 from fieldtool.design.loops import Loops
 from fieldtool.design.machine import Machine, respond
 from fieldtool.design.moves import TestMove
@@ -86,7 +86,7 @@ def moved(
     beyond = move.duration
     if machine.dry:
         beyond += min(_stuck(machine, servos, move), LONGEST_STUCK)
-    wave = _wave(eigenvalues, beyond, move.duration / 200)
+    wave = _wave(eigenvalues, beyond, watched(move.duration), move.duration / 200)
     drive = wave.spectrum(wave.move(move))
     loops = Loops(respond(machine, wave.omega), servos)
     s = 1j * wave.omega
@@ -155,7 +155,7 @@ def _worst(figures: Sequence[MoveFigures]) -> MoveFigures:
     )
 
 
-def _wave(values: ComplexArray, beyond: float, shortest: float) -> HalfWave:
+def _wave(values: ComplexArray, beyond: float, seen: float, shortest: float) -> HalfWave:
     """Return samples for a response of a machine with these eigenvalues.
 
     Parameters
@@ -163,11 +163,14 @@ def _wave(values: ComplexArray, beyond: float, shortest: float) -> HalfWave:
     values
         Eigenvalues, rad/s.
     beyond
-        s, of the reference and of what else is to be seen.
+        s, of the reference and of what else is to be waited for.
+    seen
+        s, at least, after that.
     shortest
         s: no sample is longer.
     """
-    duration = beyond + min(DECAYS / max(-float(values.real.max()), 1e-6), LONGEST)
+    rests = min(DECAYS / max(-float(values.real.max()), 1e-6), LONGEST)
+    duration = beyond + max(rests, seen)
     matters = np.abs(values)[-values.real < 1e3 / duration + 20 / beyond]
     fastest = float(matters.max()) if matters.size else 1 / shortest
     step = min(shortest, 0.5 / fastest)

@@ -86,6 +86,9 @@ def test_good_parameters_are_tried_kept_and_compared_on_one_scale(session):
         assert after["overshoot"] == pytest.approx(
             predicted["overshoot"], rel=0.1, abs=0.02 * axis["move"]["band"]
         )
+        assert after["vibration"] == pytest.approx(
+            predicted["vibration"], rel=0.2, abs=0.05 * axis["move"]["band"]
+        )
     raw = load(session.out / "verification.h5")
     assert [e.name.split(": ")[0] for e in raw.experiments] == ["before"] * 3 + ["after"] * 3
     assert (session.out / "verification.png").stat().st_size > 10_000
