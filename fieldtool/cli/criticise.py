@@ -12,7 +12,7 @@ from fieldtool.cli.output import Json, console_of, indented, print_json
 from fieldtool.cli.progress import ShareBar
 from fieldtool.cli.sheet import Sheet
 from fieldtool.criticise.criticism import Cause, Criticism
-from fieldtool.report.verdict import MEANING
+from fieldtool.report.verdict import meaning
 
 STYLES = {
     "adequate": "green",
@@ -63,11 +63,9 @@ def criticise(
 
 def show_criticism(console: Console, criticism: Criticism) -> None:
     """Show where it is wrong, the causes with their numbers, the gain, and what is left."""
-    meaning = MEANING[criticism.verdict].removeprefix(f"{criticism.verdict}: ")
+    means = meaning(criticism).removeprefix(f"{criticism.verdict}: ")
     console.print(
-        Text(f"Verdict: {criticism.verdict}", style=STYLES[criticism.verdict]).append(
-            f" ({meaning})"
-        )
+        Text(f"Verdict: {criticism.verdict}", style=STYLES[criticism.verdict]).append(f" ({means})")
     )
     for sentence in (*criticism.changes, *criticism.where):
         console.print(indented(f"{sentence}"))
@@ -108,13 +106,11 @@ def _gain(criticism: Criticism) -> Sheet:
     held = criticism.held_out
     titles = ("unseen data", "torque error before", "after", "noise", "position before", "after")
     table = Sheet(*titles, whole=titles[1:])
-    for name, before in held.error_before.items():
-        after, noise = held.error_after[name], held.noise_floor[name]
+    for name, one in criticism.judged.items():
         table.add(
-            name,
-            *("hidden" if e.torque is None else f"{100 * e.torque:.3g} %" for e in (before, after)),
-            "not known" if noise is None or before.torque is None else f"{100 * noise:.2g} %",
-            f"{100 * before.position:.2g} %",
-            f"{100 * after.position:.2g} %",
+            f"{name} (torque: all data)" if one.data == "all" else name,
+            *("hidden" if e is None else f"{100 * e:.3g} %" for e in (one.before, one.after)),
+            "not known" if one.noise is None else f"{100 * one.noise:.2g} %",
+            *(f"{100 * e[name].position:.2g} %" for e in (held.error_before, held.error_after)),
         )
     return table

@@ -11,6 +11,7 @@ from fieldtool.criticise.criticism import (
     Cause,
     Criticism,
     HeldOut,
+    Judged,
     Rejected,
     Rival,
     SignalError,
@@ -33,12 +34,7 @@ from fieldtool.criticise.search.search import Advance, Found, search
 from fieldtool.criticise.simulate.inverse import needed_torque
 from fieldtool.criticise.simulate.structure import Structure
 from fieldtool.criticise.tell_apart import experiment_for
-from fieldtool.criticise.where.sentences import (
-    AxisError,
-    axis_errors,
-    relative_error,
-    relative_noise,
-)
+from fieldtool.criticise.where.sentences import AxisError, axis_errors
 from fieldtool.errors import NotEnoughDataError
 from fieldtool.records.model import Estimate, MachineModel
 from fieldtool.records.recording import Recording
@@ -55,6 +51,8 @@ STRONG = 0.01
 """Of the power of the strongest line of a motion: lines that units are judged by."""
 OTHER_UNIT = 5.0
 """Factor between measured and needed torque from which it is no fault of the machine."""
+MORE = 2.0
+"""Error of all data over that of the unseen ones from which both are told."""
 NOTHING_UNSEEN = "there are no unseen data of it, so no cause of it can be shown"
 """Of an axis of whose torque the unseen data tell nothing."""
 
@@ -114,16 +112,16 @@ def criticise(
         ) from error
     prepared = found.prepared
     before = _axis_errors(found, found.before)
-    if all(e.hidden for e in before):
+    if all(e.data == "nothing" for e in before):
         raise NotEnoughDataError(
             f"{before[0].sentence}. So it is with all axes: nothing is criticised."
         )
     after = _axis_errors(found, found.after)
     causes = tuple(_cause(found, a, recording) for a in found.accepted)
-    held = _held_out(found)
+    held = _held_out(found, before, after)
     zeros = _false_zeros(found)
-    verdict = _verdict(causes, held, zeros, after)
-    untold = frozenset(n for n, e in held.error_after.items() if e.torque is None)
+    verdict, decide = _verdict(causes, held, zeros, after)
+    untold = frozenset(e.axis for e in after if e.data != "unseen")
     return Criticised(
         Criticism(
             verdict=verdict,
@@ -133,7 +131,8 @@ def criticise(
                 *(
                     f"{e.sentence}; {NOTHING_UNSEEN}" if e.axis in untold else e.sentence
                     for e in after
-                    if verdict != "adequate" and _matters(e.error, e.noise)
+                    if _matters(e.error, e.noise)
+                    or (e.axis in decide and _beyond_noise(e.error, e.noise))
                 ),
                 *(_unmarked(found, u) for u in found.unmarked if verdict != "adequate"),
                 *(zeros.values() if causes else ()),
@@ -147,9 +146,13 @@ def criticise(
             changes=() if prior is None else change_sentences(prior, model),
             model=extended_model(found, recording.names),
             band=(0.0, prepared.spans.top),
+            judged={
+                b.axis: _judged(b, a, a.axis in decide) for b, a in zip(before, after, strict=True)
+            },
             notes=(
                 *notes_of(recording, found.prepared),
-                *(_untold(e) for e in after if e.axis in untold and not e.hidden),
+                *(_untold(e) for e in after if e.data == "all"),
+                *(_more_in_all(e) for e in after if _shows_less(e)),
             ),
         ),
         found,
@@ -285,7 +288,11 @@ def _matters(error: float, noise: float | None) -> bool:
     """Whether an error is beyond noise, and large enough to be worth a word."""
     if noise is None:
         return error > SMALL_UNSURE
-    return error > NEAR_NOISE * noise and error**2 - noise**2 > LEFT**2
+    return _beyond_noise(error, noise) and error**2 - noise**2 > LEFT**2
+
+
+def _beyond_noise(error: float, noise: float | None) -> bool:
+    return noise is not None and error > NEAR_NOISE * noise
 
 
 def _axis(names: Sequence[str], effect: Effect) -> str | tuple[str, str]:
@@ -348,40 +355,42 @@ def _unmarked(found: Found, one: Unmarked) -> str:
     )
 
 
-def _held_out(found: Found) -> HeldOut:
+def _held_out(found: Found, before: Sequence[AxisError], after: Sequence[AxisError]) -> HeldOut:
     prepared = found.prepared
-    names = prepared.recording.names
-    errors, relative = [], []
-    lines = [one for one in prepared.simulator.lines if one.span.role == "unseen"]
-    told = {k for k in range(len(names)) if any(np.any(one.weight[:, k] > 0.0) for one in lines)}
-    for fitted in (found.before, found.after):
+    errors = []
+    for fitted, torques in ((found.before, before), (found.after, after)):
         parts = prepared.simulator.parts(fitted.hypothesis, "unseen")
         structure = Structure.of(fitted.hypothesis.machine.with_values(fitted.hypothesis.base))
         positions = position_error(structure, prepared.recording.axes, parts)
-        torques = [relative_error(parts, k) for k in range(len(names))]
-        relative.append(torques)
         errors.append(
             {
-                n: SignalError(t if k in told else None, p)
-                for k, (n, t, p) in enumerate(zip(names, torques, positions, strict=True))
+                t.axis: SignalError(t.error if t.data == "unseen" else None, p)
+                for t, p in zip(torques, positions, strict=True)
             }
         )
-    parts = prepared.simulator.parts(found.after.hypothesis, "unseen")
-    noise = [relative_noise(parts, k) for k in range(len(names))]
-    explained = {}
-    for k, name in enumerate(names):
-        floor = (noise[k] or 0.0) ** 2
-        could = max(relative[0][k] ** 2 - floor, 0.0)
-        done = relative[0][k] ** 2 - max(relative[1][k] ** 2, floor)
-        explained[name] = float(np.clip(done / could, 0.0, 1.0)) if could > 0 else 0.0
     return HeldOut(
         prepared.spans.unseen(),
         prepared.spans.split,
         errors[0],
         errors[1],
-        dict(zip(names, noise, strict=True)),
-        explained,
+        {e.axis: e.noise if e.data == "unseen" else None for e in after},
+        {b.axis: _explained(b, a) for b, a in zip(before, after, strict=True)},
     )
+
+
+def _explained(before: AxisError, after: AxisError) -> float:
+    """Return the share of the power beyond noise; where no unseen data tell, nothing is explained."""
+    floor = (after.noise or 0.0) ** 2
+    could = before.error**2 - floor
+    if before.data != "unseen" or could <= 0.0:
+        return 0.0
+    return float(np.clip((before.error**2 - max(after.error**2, floor)) / could, 0.0, 1.0))
+
+
+def _judged(before: AxisError, after: AxisError, decides: bool) -> Judged:
+    if after.data == "nothing":
+        return Judged("nothing", None, None, None, decides)
+    return Judged(after.data, before.error, after.error, after.noise, decides)
 
 
 def _false_zeros(found: Found) -> dict[str, str]:
@@ -408,34 +417,45 @@ def _untold(error: AxisError) -> str:
     )
 
 
+def _more_in_all(error: AxisError) -> str:
+    overall, _ = error.overall
+    return (
+        f"{error.axis}: {100 * overall:.2g} % of the torque of all data is not explained, but "
+        f"{100 * error.error:.2g} % of that of unseen data, by which it is judged: what is wrong of the "
+        "seen ones shows less there. Another experiment of the same motion would test it."
+    )
+
+
+def _shows_less(error: AxisError) -> bool:
+    """Whether all data have an error that the data which an axis is judged by hardly have."""
+    return _matters(*error.overall) and error.overall[0] > MORE * error.error
+
+
 def _verdict(
     causes: Sequence[Cause], held: HeldOut, zeros: Mapping[str, str], after: Sequence[AxisError]
-) -> Verdict:
-    """Judge what is left on unseen data; of an axis that these say nothing of, on all data.
+) -> tuple[Verdict, frozenset[str]]:
+    """Judge what is left of every axis on the data that it is judged by.
 
-    There nothing is explained, whatever a fit makes of it.
+    Returns
+    -------
+    verdict, axes
+        The axes but for which the verdict would be better.
     """
-    names = list(held.error_before)
-    errors, noises = {e.axis: e.error for e in after}, {e.axis: e.noise for e in after}
-    for n, error in held.error_after.items():
-        if error.torque is not None:
-            errors[n], noises[n] = error.torque, held.noise_floor[n]
-    left = {n for n in names if _matters(errors[n], noises[n])}
+    left = frozenset(e.axis for e in after if _matters(e.error, e.noise))
     if not causes:
-        return "unexplained" if left else "adequate"
-    # Beside a cause that has a name even little counts: it may be of another cause than of that one.
-    of_axis = {n: [c for c in causes if n in c.axes] for n in names}
-    left |= {
-        n
-        for n, noise in noises.items()
-        if noise is not None and errors[n] > NEAR_NOISE * noise and of_axis[n]
-    }
-    for n in left:
-        sure = all(LIBRARY[c.effect].exact for c in of_axis[n])
-        enough = ENOUGH if noises[n] is None else ENOUGH_SURE if sure else ENOUGH_KNOWN
-        if held.explained[n] < enough:
-            return "partly explained"
-    return "partly explained" if any(of_axis[n] for n in zeros) else "explained"
+        return ("unexplained" if left else "adequate"), left
+    short = set()
+    for e in after:
+        mine = [c for c in causes if e.axis in c.axes]
+        # Beside a cause that has a name even little counts: it may be of another cause than of that one.
+        if e.axis in left or (mine and _beyond_noise(e.error, e.noise)):
+            sure = all(LIBRARY[c.effect].exact for c in mine)
+            enough = ENOUGH if e.noise is None else ENOUGH_SURE if sure else ENOUGH_KNOWN
+            if held.explained[e.axis] < enough:
+                short.add(e.axis)
+        if mine and e.axis in zeros:
+            short.add(e.axis)
+    return ("partly explained" if short else "explained"), frozenset(short)
 
 
 def context_of(criticised: Criticised) -> Context:

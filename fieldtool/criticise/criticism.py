@@ -1,7 +1,7 @@
 """What criticism finds, as one frozen value; ``criticism.yaml`` holds it."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from math import isfinite
 from typing import Any, Literal
 
@@ -9,6 +9,9 @@ from fieldtool.records.model import MachineModel
 
 FORMAT = "fieldtool-criticism/1"
 Verdict = Literal["adequate", "explained", "partly explained", "unexplained"]
+Base = Literal["unseen", "all", "nothing"]
+"""Data that an axis is judged by: what no fit has seen; all, where that tells nothing of its torque;
+nothing, where not even all data do."""
 
 
 @dataclass(frozen=True)
@@ -73,6 +76,21 @@ class SignalError:
 
 
 @dataclass(frozen=True)
+class Judged:
+    """What the verdict, its sentences and the tables say of the torque of one axis."""
+
+    data: Base
+    before: float | None
+    """RMS of measured minus simulated over RMS of measured, in these data, without effects."""
+    after: float | None
+    """With the causes; the same where there is none."""
+    noise: float | None
+    """In the same measure; None where no period repeats."""
+    decides: bool
+    """Whether the verdict would be better without what is left of this axis."""
+
+
+@dataclass(frozen=True)
 class HeldOut:
     """Before and after, on what no fit has seen."""
 
@@ -102,7 +120,7 @@ class Criticism:
 
     verdict: Verdict
     where: tuple[str, ...]
-    """One sentence an axis: the error of the machine without effects."""
+    """One sentence an axis: the error of the machine without effects, of the data it is judged by."""
     causes: tuple[Cause, ...]
     """In order of gain."""
     unexplained: tuple[str, ...]
@@ -115,6 +133,8 @@ class Criticism:
     """With the effects, and masses and springs fitted beside them."""
     band: tuple[float, float]
     """Frequencies compared, Hz."""
+    judged: Mapping[str, Judged]
+    """By axis."""
     notes: tuple[str, ...] = field(default=())
 
     def as_dict(self) -> dict[str, Any]:
@@ -154,6 +174,7 @@ class Criticism:
                 "noise_floor": dict(held.noise_floor),
                 "explained": dict(held.explained),
             },
+            "judged": {name: asdict(j) for name, j in self.judged.items()},
             "rejected": [
                 {
                     "effect": r.effect,

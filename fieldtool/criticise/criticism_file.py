@@ -7,9 +7,11 @@ from pydantic import Field
 
 from fieldtool.criticise.criticism import (
     FORMAT,
+    Base,
     Cause,
     Criticism,
     HeldOut,
+    Judged,
     Number,
     Rejected,
     Rival,
@@ -62,6 +64,14 @@ class _HeldOut(StrictModel):
     explained: dict[str, Value]
 
 
+class _Judged(StrictModel):
+    data: Base
+    before: Value | None
+    after: Value | None
+    noise: Value | None
+    decides: bool
+
+
 class _Rejected(StrictModel):
     effect: str
     axis: Axes
@@ -76,6 +86,7 @@ class _Criticism(StrictModel):
     causes: list[_Cause]
     unexplained: list[str]
     held_out: _HeldOut
+    judged: dict[str, _Judged] = Field(default_factory=dict)
     rejected: list[_Rejected]
     changes: list[str]
     band_hz: tuple[Value, Value]
@@ -102,11 +113,17 @@ def read_criticism(path: Path, model: MachineModel) -> Criticism:
             path, f"format must be {FORMAT}, got {data.format!r}", line_of(lines, ("format",))
         )
     held = data.held_out
-    if not set(held.error_before) == set(held.error_after) == set(held.noise_floor):
+    axes = set(held.error_before)
+    if not axes == set(held.error_after) == set(held.noise_floor):
         raise FileFormatError(
             path,
             "held_out does not speak of the same axes everywhere.",
             line_of(lines, ("held_out",)),
+        )
+    judged = {name: Judged(**one.model_dump()) for name, one in data.judged.items()}
+    if judged and set(judged) != axes:
+        raise FileFormatError(
+            path, "judged is not of the axes of held_out.", line_of(lines, ("judged",))
         )
     return Criticism(
         data.verdict,
@@ -125,8 +142,17 @@ def read_criticism(path: Path, model: MachineModel) -> Criticism:
         tuple(data.changes),
         model,
         data.band_hz,
+        judged or {name: _as_unseen(held, name) for name in held.error_before},
         tuple(data.notes),
     )
+
+
+def _as_unseen(held: _HeldOut, name: str) -> Judged:
+    """Return what a file without ``judged`` says of an axis; which axes decided, it does not."""
+    before, after = held.error_before[name].torque, held.error_after[name].torque
+    if before is None:
+        return Judged("nothing", None, None, None, decides=False)
+    return Judged("unseen", before, after, held.noise_floor[name], decides=False)
 
 
 def _cause(data: _Cause) -> Cause:

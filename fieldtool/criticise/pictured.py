@@ -23,6 +23,7 @@ from fieldtool.criticise.where.sentences import (
     LevelError,
     Parts,
     experiment_errors,
+    judged_by,
     line_kinds,
     relative_error,
     relative_noise,
@@ -95,11 +96,12 @@ Sides = tuple[_Side, ...]
 
 
 def _quiet(sides: Sides, axis: int) -> str:
-    """Say that there is nothing but noise; empty where there is more."""
-    before, noise = relative_error(sides[0].parts, axis), relative_noise(sides[0].parts, axis)
-    if noise is not None and before < NOISY * noise:
-        return NOISE_ONLY
-    return ""
+    """Say that there is nothing but noise; empty where all data, or those that are judged, have more."""
+    for parts in (sides[0].parts, judged_by(sides[0].parts, axis)[1]):
+        noise = relative_noise(parts, axis)
+        if noise is None or relative_error(parts, axis) >= NOISY * noise:
+            return ""
+    return NOISE_ONLY
 
 
 def _by_frequency(sides: Sides, axis: int) -> Picture:

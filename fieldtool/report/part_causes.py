@@ -1,10 +1,10 @@
 """Causes, what is gained by knowing them, what is left, and what was rejected."""
 
-from fieldtool.criticise.criticism import Criticism
+from fieldtool.criticise.criticism import Criticism, Judged
 from fieldtool.report.figures import bars_figure
 from fieldtool.report.material import Material
 from fieldtool.report.section import Block, Plot, Plots, Section, Table, Words
-from fieldtool.report.verdict import MEANING
+from fieldtool.report.verdict import meaning
 from fieldtool.report.words import axis_words, cause_words, effect_words, number_words, percent
 
 
@@ -14,7 +14,7 @@ def causes(material: Material) -> Section | None:
     if criticism is None:
         return None
     if not criticism.causes:
-        return Section("Causes", f"No cause is named. The verdict is {MEANING[criticism.verdict]}.")
+        return Section("Causes", f"No cause is named. The verdict is {meaning(criticism)}.")
     rows = tuple(
         (
             effect_words(c.effect),
@@ -31,7 +31,7 @@ def causes(material: Material) -> Section | None:
         Words(tuple(f"{cause_words(c)}: {c.evidence}." for c in criticism.causes), "list"),
         *_ties(criticism),
     ]
-    return Section("Causes", f"The verdict is {MEANING[criticism.verdict]}.", tuple(blocks))
+    return Section("Causes", f"The verdict is {meaning(criticism)}.", tuple(blocks))
 
 
 def _ties(criticism: Criticism) -> list[Block]:
@@ -67,27 +67,33 @@ def gain(material: Material) -> Section | None:
     meaning = "An error is the RMS of measured minus simulated over the RMS of measured."
     if not criticism.causes:
         plain = tuple(
-            (name, percent(e.torque), percent(held.noise_floor[name]), percent(e.position))
-            for name, e in held.error_before.items()
+            (
+                _row(name, one),
+                percent(one.before),
+                percent(one.noise),
+                percent(held.error_before[name].position),
+            )
+            for name, one in criticism.judged.items()
         )
         table = Table(("axis", "torque: error", "noise floor", "position: error"), plain)
         return Section("The error on data that no fit has seen", meaning, (table, unseen))
     rows = tuple(
         (
-            name,
-            percent(first.torque),
-            percent(held.error_after[name].torque),
-            percent(held.noise_floor[name]),
+            _row(name, one),
+            percent(one.before),
+            percent(one.after),
+            percent(one.noise),
             percent(held.explained.get(name)),
-            percent(first.position),
+            percent(held.error_before[name].position),
             percent(held.error_after[name].position),
         )
-        for name, first in held.error_before.items()
+        for name, one in criticism.judged.items()
     )
+    unseen_only = {n: one for n, one in criticism.judged.items() if one.data == "unseen"}
     groups: dict[str, dict[str, float | None]] = {
-        "before": {n: _hundredfold(e.torque) for n, e in held.error_before.items()},
-        "after": {n: _hundredfold(e.torque) for n, e in held.error_after.items()},
-        "noise floor": {n: _hundredfold(v) for n, v in held.noise_floor.items()},
+        "before": {n: _hundredfold(one.before) for n, one in unseen_only.items()},
+        "after": {n: _hundredfold(one.after) for n, one in unseen_only.items()},
+        "noise floor": {n: _hundredfold(one.noise) for n, one in unseen_only.items()},
     }
     table = Table(
         (
@@ -109,6 +115,10 @@ def gain(material: Material) -> Section | None:
         meaning,
         (table, Plots((plot,), 2), unseen),
     )
+
+
+def _row(name: str, one: Judged) -> str:
+    return f"{name} (torque: all data)" if one.data == "all" else name
 
 
 def unexplained(material: Material) -> Section | None:

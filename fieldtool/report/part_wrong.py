@@ -29,7 +29,8 @@ def wrong(material: Material) -> Section | None:
     where = Words(tuple(f"{s}." for s in criticism.where), "list")
     said = (
         "The torque that the simulated machine needs for the measured motion is taken off the measured "
-        "torque: what is left is the error."
+        "torque: what is left is the error. The sentences above give its size on the data that the "
+        "verdict rests on; the pictures show all data."
     )
     if criticism.causes:
         said += (

@@ -1,17 +1,15 @@
 """The first sentence of a report: what matters, for people who read no further."""
 
-from fieldtool.criticise.criticism import Criticism, HeldOut
+from collections.abc import Sequence
+
+from fieldtool.criticise.criticism import Base, Criticism, Judged
 from fieldtool.report.material import Material
 from fieldtool.report.words import cause_words, listed, percent
 
 MEANING = {
-    "adequate": (
-        "adequate: what the simulation leaves is noise, or below 1 % of the torque, on data that no fit "
-        "has seen"
-    ),
+    "adequate": ("adequate: what the simulation leaves is noise, or below 1 % of the torque"),
     "explained": (
-        "explained: the causes account for at least 90 % of the error's power beyond noise, on data "
-        "that no fit has seen"
+        "explained: the causes account for at least 90 % of the error's power beyond noise"
     ),
     "partly explained": (
         "partly explained: causes were found, and something is left that none of the known ones explains"
@@ -29,6 +27,23 @@ TONES = {
 }
 
 
+def meaning(criticism: Criticism) -> str:
+    """Say what the verdict means, and which data it rests on."""
+    return f"{MEANING[criticism.verdict]}, {_data(criticism)}"
+
+
+def _data(criticism: Criticism) -> str:
+    unseen, whole = _of_data(criticism, "unseen"), _of_data(criticism, "all")
+    if not unseen and whole:
+        return "on all data: what no fit has seen tells nothing"
+    beside = f" (of {listed(whole)} on all data)" if whole else ""
+    return f"on data that no fit has seen{beside}"
+
+
+def _of_data(criticism: Criticism, data: Base) -> list[str]:
+    return [name for name, one in criticism.judged.items() if one.data == data]
+
+
 def verdict(material: Material) -> tuple[str, str]:
     """Return one plain sentence, and its tone: good, mixed or open."""
     if material.criticism is not None:
@@ -43,48 +58,61 @@ def verdict(material: Material) -> tuple[str, str]:
 
 
 def _of(criticism: Criticism) -> str:
-    held = criticism.held_out
-    told = [n for n, error in held.error_before.items() if error.torque is not None]
-    worst = max(told, key=lambda n: held.error_before[n].torque or 0.0, default="")
-    untold = "".join(f" {sentence}." for sentence in _untold(criticism))
-    if not worst or (untold and not criticism.causes):
-        return f"The verdict is: {MEANING[criticism.verdict]}.{untold or _still(held)}"
-    before, after = held.error_before[worst].torque, held.error_after[worst].torque
-    noise = held.noise_floor[worst]
-    beyond = "" if noise is None else f" (noise {percent(noise)})"
+    judged, unseen = criticism.judged, _of_data(criticism, "unseen")
+    decide = [name for name, one in judged.items() if one.decides]
     if criticism.verdict == "adequate":
+        if not unseen:
+            return f"The verdict is: {meaning(criticism)}.{_not_unseen(criticism)}"
+        most = judged[max(unseen, key=lambda n: judged[n].after or 0.0)]
         return (
-            f"The simulation does as the machine does: at most {percent(after)} of the torque of unseen "
-            f"data is not explained{beyond}, which is noise or does not matter.{_still(held)}"
+            f"The simulation does as the machine does: at most {percent(most.after)} of the torque of "
+            f"unseen data is not explained{_noise(most)}, which is noise or does not matter."
+            f"{_not_unseen(criticism)}"
         )
+    # without a cause, what decided is told; with causes, what they are of
+    of_causes = {n for c in criticism.causes for n in c.axes}
+    about = [n for n in unseen if n in (of_causes if criticism.causes else decide)]
+    if not about:
+        return f"The verdict is: {meaning(criticism)}.{_sentences(criticism, decide)}"
+    worst = max(about, key=lambda n: judged[n].before or 0.0)
+    one = judged[worst]
     if not criticism.causes:
+        untold = [n for n in decide if n not in unseen]
         return (
-            f"The simulation is wrong by {percent(before)} of the torque of {worst}{beyond}, and "
-            "none of the known causes explains it."
+            f"The simulation is wrong by {percent(one.before)} of the torque of {worst}{_noise(one)} on "
+            f"unseen data, and none of the known causes explains it.{_sentences(criticism, untold)}"
         )
     named = listed([cause_words(c) for c in criticism.causes])
     ties = " Another cause would explain the data as well (see below)." if any(
         c.ties for c in criticism.causes
     ) else ""  # fmt: skip
     how = "explains" if len(criticism.causes) == 1 else "explain"
-    partly = " in part" if criticism.verdict == "partly explained" else ""
+    partly = " in part" if one.decides else ""
+    others = _sentences(criticism, [n for n in decide if n != worst])
     return (
-        f"The simulation was wrong by {percent(before)} of the torque of {worst}; {named} {how} "
-        f"it{partly}: with it, {percent(after)} is left{beyond}.{ties}{untold}"
+        f"The simulation was wrong by {percent(one.before)} of the torque of {worst} on unseen data; "
+        f"{named} {how} it{partly}: with it, {percent(one.after)} is left{_noise(one)}.{ties}{others}"
     )
 
 
-def _untold(criticism: Criticism) -> tuple[str, ...]:
-    """Return what is unexplained of axes that the unseen data say nothing of."""
-    errors = criticism.held_out.error_before
-    axes = tuple(f"{name}: " for name, error in errors.items() if error.torque is None)
-    return tuple(s for s in criticism.unexplained if s.startswith(axes))
+def _noise(one: Judged) -> str:
+    return "" if one.noise is None else f" (noise {percent(one.noise)})"
 
 
-def _still(held: HeldOut) -> str:
-    """Say which axes the unseen data say nothing of."""
-    axes = [name for name, error in held.error_before.items() if error.torque is None]
-    return f" They say nothing of {listed(axes)}." if axes else ""
+def _sentences(criticism: Criticism, axes: Sequence[str]) -> str:
+    """Return what is unexplained of some axes."""
+    mine = tuple(f"{name}: " for name in axes)
+    return "".join(f" {s}." for s in criticism.unexplained if s.startswith(mine))
+
+
+def _not_unseen(criticism: Criticism) -> str:
+    """Say which axes the unseen data say nothing of, and what all data say of them."""
+    axes = [name for name, one in criticism.judged.items() if one.data != "unseen"]
+    said = f" They say nothing of {listed(axes)}." if axes else ""
+    for name in _of_data(criticism, "all"):
+        one = criticism.judged[name]
+        said += f" All data leave {percent(one.after)} of the torque of {name}{_noise(one)}."
+    return said
 
 
 def _stopped(material: Material) -> str:

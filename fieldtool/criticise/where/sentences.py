@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from fieldtool.criticise.criticism import Base
 from fieldtool.criticise.effects.base import Context
 from fieldtool.criticise.evidence.lines import Lines, unflat
 from fieldtool.criticise.where.views import View, views_of
@@ -36,19 +37,17 @@ SIMPLE = (
 
 @dataclass(frozen=True)
 class AxisError:
-    """How wrong one axis is, in the band, on all rows that are compared."""
+    """How wrong one axis is, in the band, on the rows that it is judged by."""
 
     axis: str
+    data: Base
     error: float
     """RMS of torque measured less simulated over RMS of the torque."""
     noise: float | None
     """The same of the noise; None where no period repeats."""
-    views: tuple[View, ...]
-    band: tuple[float, float]
-    """Hz: a third-octave band that has most of the error."""
+    overall: tuple[float, float | None]
+    """Error and noise on all rows that are compared."""
     sentence: str
-    hidden: bool = False
-    """Whether its encoder hides at all frequencies what torque its motion needs."""
 
 
 @dataclass(frozen=True)
@@ -74,13 +73,13 @@ class LineKinds:
 
 
 def axis_errors(context: Context, parts: Parts) -> tuple[AxisError, ...]:
-    """Say of every axis how wrong it is, and what the error follows."""
+    """Say of every axis how wrong it is on the data that it is judged by, and what the error follows."""
     out = []
     for axis, info in enumerate(context.axes):
-        error, noise = relative_error(parts, axis), relative_noise(parts, axis)
-        views = views_of(context, axis)
-        band = _band(parts, axis)
-        if not any(np.any(lines.weight[:, axis] > 0.0) for lines, _ in parts):
+        data, judged = judged_by(parts, axis)
+        error, noise = relative_error(judged, axis), relative_noise(judged, axis)
+        overall = relative_error(parts, axis), relative_noise(parts, axis)
+        if data == "nothing":
             why = (
                 "at all frequencies its encoder's steps or noise hide what torque its motion needs; "
                 "larger motions would show it"
@@ -88,13 +87,22 @@ def axis_errors(context: Context, parts: Parts) -> tuple[AxisError, ...]:
                 else "it stands still in all that is compared"
             )
             sentence = f"{info.name}: nothing can be said of its torque: {why}"
-            out.append(AxisError(info.name, error, noise, views, band, sentence, hidden=True))
-            continue
-        out.append(
-            AxisError(info.name, error, noise, views, band,
-                      _sentence(context, parts, axis, error, noise, views, band))
-        )  # fmt: skip
+        else:
+            sentence = _sentence(context, parts, axis, error, noise)
+        out.append(AxisError(info.name, data, error, noise, overall, sentence))
     return tuple(out)
+
+
+def judged_by(parts: Parts, axis: int) -> tuple[Base, Parts]:
+    """Return the rows that an axis is judged by: unseen ones where they tell of its torque, else all."""
+    unseen = [(lines, v) for lines, v in parts if lines.span.role == "unseen"]
+    if _tells(unseen, axis):
+        return "unseen", unseen
+    return ("all" if _tells(parts, axis) else "nothing"), parts
+
+
+def _tells(parts: Parts, axis: int) -> bool:
+    return any(np.any(lines.weight[:, axis] > 0.0) for lines, _ in parts)
 
 
 def relative_error(parts: Parts, axis: int) -> float:
@@ -196,20 +204,28 @@ def _sentence(
     axis: int,
     error: float,
     noise: float | None,
-    views: Sequence[View],
-    band: tuple[float, float],
 ) -> str:
+    """Say how large the error is on the data that the axis is judged by, and its form in all data."""
     name = context.axes[axis].name
+    data, judged = judged_by(parts, axis)
     if noise is not None and error < 1.5 * noise:
         return (
-            f"{name}: the torque is explained to {_percent(error)}; its noise is {_percent(noise)}"
+            f"{name}: the torque of {data} data is explained to {_percent(error)}; its noise is "
+            f"{_percent(noise)}"
         )
-    clause = _follows(views)
-    if not clause:
-        clause = f"most of it lies between {band[0]:.3g} and {band[1]:.3g} Hz"
-    extra = _in_time(parts, axis) or _with_amplitude(parts, axis)
+    clauses = []
+    follows = _follows(views_of(context, axis))
+    if not follows:
+        low, high = _band(judged, axis)
+        clauses.append(f"most of it lies between {low:.3g} and {high:.3g} Hz")
+    looks = [w for w in (follows, _in_time(parts, axis) or _with_amplitude(parts, axis)) if w]
+    if looks:
+        clauses.append(f"{'in all data ' if data == 'unseen' else ''}it {', and '.join(looks)}")
     beyond = f" (noise {_percent(noise)})" if noise is not None else ""
-    return f"{name}: {_percent(error)} of the torque is not explained{beyond}; {clause}{extra}"
+    return (
+        f"{name}: {_percent(error)} of the torque of {data} data is not explained{beyond}; "
+        f"{'; '.join(clauses)}"
+    )
 
 
 def _follows(views: Sequence[View]) -> str:
@@ -218,7 +234,7 @@ def _follows(views: Sequence[View]) -> str:
         return ""
     alike = [v for v in showing if v.share > showing[0].share - ALIKE]
     best = min(alike, key=lambda v: SIMPLE.index(v.name))
-    return f"it {best.words} ({100 * best.share:.0f} % of it)"
+    return f"{best.words} ({100 * best.share:.0f} % of it)"
 
 
 def _in_time(parts: Parts, axis: int) -> str:
@@ -231,9 +247,9 @@ def _in_time(parts: Parts, axis: int) -> str:
     if not early or not late:
         return ""
     if late > CHANGED * early:
-        return f", and is {late / early:.1f} times as large in the later half of the data"
+        return f"is {late / early:.1f} times as large in the later half"
     if early > CHANGED * late:
-        return f", and is {early / late:.1f} times as large in the earlier half of the data"
+        return f"is {early / late:.1f} times as large in the earlier half"
     return ""
 
 
@@ -250,9 +266,9 @@ def _with_amplitude(parts: Parts, axis: int) -> str:
         return ""
     slope = float(np.polyfit(np.log(torque), np.log(error), 1)[0])
     if slope < -GROWS:
-        return ", relatively larger at small amplitudes"
+        return "is relatively larger at small amplitudes"
     if slope > GROWS:
-        return ", relatively larger at large amplitudes"
+        return "is relatively larger at large amplitudes"
     return ""
 
 
