@@ -10,7 +10,9 @@ from fieldtool.errors import IdentificationError, NotEnoughDataError
 from fieldtool.identify.chains.order import select_order
 from fieldtool.identify.likelihood.refine import machine_response
 from fieldtool.identify.likelihood.response_data import ResponseMatrix
-from fieldtool.identify.modes.search import find_modes
+from fieldtool.identify.modes import fit as modal_fit
+from fieldtool.identify.modes.poles import Poles
+from fieldtool.identify.modes.search import _by_visibility, find_modes
 from fieldtool.records.model import AxisModel, Coupling, Estimate, MachineModel
 
 
@@ -217,3 +219,22 @@ def test_rigid_axes_are_rigid(with_prior, wrong, fresh_rng):
     values = {c.axes: c.value for c in found.model.couplings}
     assert values["table", "arm"] == pytest.approx(0.009, rel=0.02)
     assert values["table", "wrist"] == pytest.approx(0.0, abs=2e-4)
+
+
+@pytest.mark.parametrize(
+    ("eigenvalues", "modes"),
+    [((2.0, 1.0), 2), ((2.0, 0.1), 1), ((2.0, -1e9), 1), ((0.0, -1e9), 1), ((-1e9, -2e9), 1)],
+)
+@pytest.mark.parametrize("height", [4.0, 1e3])
+def test_a_pole_that_pulls_where_it_should_push_is_one_mode(
+    monkeypatch, eigenvalues, modes, height
+):
+    """Such residues are of noise."""
+    omega = np.geomspace(1.0, 100.0, 20)
+    data = ResponseMatrix(("a", "b"), omega, np.ones((20, 2, 2), complex), np.ones((20, 2, 2)))
+    found = Poles(np.array([-0.1 + 10.0j]), np.zeros(0))
+    residues = np.diag(eigenvalues)[:, :, None]
+    monkeypatch.setattr(modal_fit, "pole_residues", lambda *_: residues)
+    monkeypatch.setattr(modal_fit, "visibility", lambda *_: np.array([height]))
+    poles = _by_visibility(data, found, np.zeros(2))
+    assert poles.tolist() == [-0.1 + 10.0j] * (modes if height > 100 else 1)

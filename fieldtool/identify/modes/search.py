@@ -237,8 +237,9 @@ def _by_visibility(data: ResponseMatrix, found: Poles, delays: FloatArray) -> Co
     kept: list[tuple[float, complex]] = []
     for r in np.flatnonzero(good):
         values = np.linalg.eigvalsh(residues[:, :, r])[::-1]
-        share = values / max(values[0], 1e-300)
-        count = max(int(np.count_nonzero((share > EQUAL) & (share * height[r] > CLEAR))), 1)
+        # Not divided by the first, which noise may make 0 or negative: such a pole is one mode.
+        least = max(EQUAL, CLEAR / height[r]) * max(values[0], 0.0)
+        count = max(int(np.count_nonzero(values > least)), 1)
         kept += [(float(height[r]), complex(found.pairs[r]))] * count
     kept.sort(key=lambda pair: -pair[0])
     return np.array([pole for _, pole in kept], dtype=np.complex128)
