@@ -1,5 +1,7 @@
 """All chains at once: from modes to machines of any lengths, and what the structure tells."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.linalg import eigh
@@ -238,3 +240,22 @@ def test_what_is_wrong_with_the_question_is_said(random_model, fresh_rng):
     )
     with pytest.raises(NotEnoughDataError, match="axis1 and axis2"):
         reduce_blocks(half, {"axis1": 2, "axis2": 3})
+
+
+@pytest.mark.parametrize("friction", [1e100, 1e200])
+def test_what_a_fit_gone_astray_says_is_not_known(friction):
+    truth = paper_machine()
+    astray = replace(modes_of(truth), friction=np.array([friction, 0.0, 0.0]))
+    result = reduce_blocks(astray, lengths_of(truth))
+    assert all(np.isinf(e.std) for e in numbers(result.model))
+    assert np.isinf(result.misfit)
+
+
+@pytest.mark.parametrize("seen", [0.0, 1e-200, 1e-100])
+def test_a_mode_without_what_is_in_phase_is_no_machine_of_chains(seen):
+    truth = paper_machine()
+    modal = modes_of(truth)
+    phi, chi = modal.phi.copy(), np.zeros_like(modal.phi)
+    phi[:, 2] *= seen
+    chi[:, 2] = 0.1
+    assert reduce_blocks(replace(modal, phi=phi, chi=chi), lengths_of(truth)).misfit > 1e6

@@ -201,20 +201,26 @@ class _Variants:
         return derivatives
 
     def covariance(self, modal: ModalModel) -> FloatArray:
-        """Of the numbers, shape (P, P), with the squares that modes neglect."""
-        phi, chi = np.linalg.norm(modal.phi, axis=0), np.linalg.norm(modal.chi, axis=0)
-        drag = np.diag(modal.rigid) * np.abs(modal.friction)
-        slow = (drag.max(initial=0.0) / modal.omega.min(initial=np.inf)) ** 2
-        neglected = (chi / np.maximum(phi, 1e-300)) ** 2
+        """Of the numbers, shape (P, P), with the squares that modes neglect.
+
+        Of a fit gone astray these are infinite or no numbers: nothing is known there, as
+        :func:`~fieldtool.identify.likelihood.least_squares.propagate` takes it.
+        """
         size = np.sqrt(np.diag(modal.rigid))
         i, j = modal.parts.upper
-        errors = np.r_[
-            modal.omega * neglected,
-            np.tile(phi * (neglected + slow), modal.phi.shape[0]),
-            size[i] * size[j] * slow,
-        ]
+        with np.errstate(over="ignore", invalid="ignore"):
+            phi, chi = np.linalg.norm(modal.phi, axis=0), np.linalg.norm(modal.chi, axis=0)
+            drag = np.diag(modal.rigid) * np.abs(modal.friction)
+            slow = (drag.max(initial=0.0) / modal.omega.min(initial=np.inf)) ** 2
+            neglected = (chi / np.maximum(phi, 1e-300)) ** 2
+            errors = np.r_[
+                modal.omega * neglected,
+                np.tile(phi * (neglected + slow), modal.phi.shape[0]),
+                size[i] * size[j] * slow,
+            ]
+            variances = errors**2
         covariance: FloatArray = modal.covariance[np.ix_(self.columns, self.columns)]
-        return np.asarray(covariance + np.diag(errors**2), dtype=np.float64)
+        return np.asarray(covariance + np.diag(variances), dtype=np.float64)
 
 
 def _values(rows: ChainRows) -> FloatArray:
