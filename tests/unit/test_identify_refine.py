@@ -7,12 +7,18 @@ import pytest
 
 from fieldtool.errors import IdentificationError, NotEnoughDataError
 from fieldtool.identify.features import chain_features
+from fieldtool.identify.likelihood.least_squares import Fit
 from fieldtool.identify.likelihood.parameters import (
     machine_parameters,
     parameter_values,
     with_values,
 )
-from fieldtool.identify.likelihood.refine import machine_response, refine, response_derivatives
+from fieldtool.identify.likelihood.refine import (
+    _open_directions,
+    machine_response,
+    refine,
+    response_derivatives,
+)
 from fieldtool.identify.likelihood.response_data import ResponseMatrix
 from fieldtool.records.model import AxisModel, Coupling, Estimate, MachineModel
 from tests.seeds import fresh_seed
@@ -224,3 +230,15 @@ def test_features_are_those_of_one_axis(rng):
     found = refine(two_axes(), data)
     with pytest.raises(ValueError, match="the model has x, y"):
         chain_features(found)
+
+
+def test_what_hardly_leaves_a_trace_can_change_together_by_any_amount():
+    faint = 1e-200 * np.array([[1.0, -1.0], [0.5, 0.5]])
+    jacobian = np.zeros((4, 3))
+    jacobian[0, 0], jacobian[1:3, 1:] = 1.0, faint
+    known, *others = [p for p in machine_parameters(bench(), np.ones(1)) if p.logarithmic][:3]
+    solution = Fit(np.zeros(3), jacobian, np.full(4, 1e120))
+    found = _open_directions(solution, [known, *others], np.full(3, True))
+    assert [one.parameters for one in found] == [tuple(p.name for p in others)] * 2
+    assert all(np.isinf(one.relative_std) for one in found)
+    assert "can change together (by any amount) without" in found[0].reason

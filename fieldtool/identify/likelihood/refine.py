@@ -13,7 +13,7 @@ errors, but are not modelled.
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from math import inf
+from math import inf, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -363,15 +363,16 @@ def _open_directions(
     _, singular, rows = np.linalg.svd(solution.triangle, full_matrices=False)
     found = []
     for s, row in zip(singular, rows, strict=True):
-        relative = np.sqrt(solution.felt_excess) / s if s > 0.0 else inf
+        relative = sqrt(solution.felt_excess) / float(s) if s > 0.0 else inf
         involved = np.flatnonzero((np.abs(row) > 0.3) & logarithmic)
         if relative > UNKNOWN_ABOVE and involved.size > 1:
             names = tuple(parameters[k].name for k in involved)
+            amount = f"{relative:.2g} of their values" if relative < inf else "any amount"
             found.append(
                 Unknown(
                     names,
                     float(relative),
-                    f"{', '.join(names)} can change together (by {relative:.2g} of their values) "
+                    f"{', '.join(names)} can change together (by {amount}) "
                     "without a misfit beyond the noise: only combinations of them are known; fix "
                     "one, or give what is known of it",
                 )
