@@ -150,7 +150,7 @@ def criticise(
                 b.axis: _judged(b, a, a.axis in decide) for b, a in zip(before, after, strict=True)
             },
             notes=(
-                *notes_of(recording, found.prepared),
+                *notes_of(recording, found.prepared, _of_unknown_noise(after)),
                 *(_untold(e) for e in after if e.data == "all"),
                 *(_more_in_all(e) for e in after if _shows_less(e)),
             ),
@@ -408,6 +408,10 @@ def _false_zeros(found: Found) -> dict[str, str]:
                 "largest torque"
             )
     return said
+
+
+def _of_unknown_noise(errors: Sequence[AxisError]) -> list[str]:
+    return [e.axis for e in errors if e.data != "nothing" and e.noise is None]
 
 
 def _untold(error: AxisError) -> str:

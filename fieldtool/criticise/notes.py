@@ -23,13 +23,15 @@ QUANTA, CREST = 20, 1.5
 A torque that is the same all the time (dry friction at constant speed), or a sine, has no more."""
 
 
-def notes_of(recording: Recording, prepared: Prepared) -> tuple[str, ...]:
+def notes_of(recording: Recording, prepared: Prepared, unknown: Sequence[str]) -> tuple[str, ...]:
     """Say how the data are cut, whether the noise is known, and what of each axis is not as it might be.
 
     Parameters
     ----------
     recording : Recording
     prepared : Prepared
+    unknown : sequence of str
+        Axes whose noise the data that they are judged by do not tell.
     """
     spans = prepared.spans
     notes = []
@@ -39,14 +41,16 @@ def notes_of(recording: Recording, prepared: Prepared) -> tuple[str, ...]:
             "There are no experiments of a kind twice, so the data are cut in time: "
             f"{seconds * recording.sample_period:.3g} s are kept unseen, in {_stretches(spans)}."
         )
-    if any(s.periods < 2 for s in spans.spans):
+    if unknown and any(s.periods < 2 for s in spans.spans):
         why = (
-            "No stretch that is compared holds a period twice"
+            f"{'Not every' if any(s.periods > 1 for s in spans.spans) else 'No'} stretch that is "
+            "compared holds a period twice"
             if any(e.period for e in recording.experiments if e.kind == "multisine")
             else "The excitation does not repeat"
         )
+        of = "" if len(unknown) == len(recording.axes) else f" of {', '.join(unknown)}"
         notes.append(
-            f"{why}, so the noise is not known: what is not explained may in part be noise."
+            f"{why}, so the noise{of} is not known: what is not explained may in part be noise."
         )
     for k, axis in enumerate(recording.axes):
         if axis.controller is None:

@@ -86,7 +86,7 @@ def repeated(sizes, noise, error):
                 torque, position_reference=None,
             )
         )  # fmt: skip
-    return criticise(*recorded(experiments, "ab"))
+    return recorded(experiments, "ab")
 
 
 def screen(criticism):
@@ -122,7 +122,7 @@ def test_an_error_that_only_seen_data_have_is_told_beside_the_verdict(apart):
 
 
 def test_an_error_that_all_data_drown_in_their_noise_has_its_sentence_and_its_pictures():
-    found = repeated((1.0, 1.0), noise=0.02, error=(0.0, 0.014))
+    found = criticise(*repeated((1.0, 1.0), noise=0.02, error=(0.0, 0.014)))
     criticism, b = found.criticism, found.criticism.judged["b"]
     assert criticism.verdict == "unexplained"
     assert found.after[1].overall[0] < 1.5 * found.after[1].overall[1]
@@ -134,11 +134,39 @@ def test_an_error_that_all_data_drown_in_their_noise_has_its_sentence_and_its_pi
 
 
 def test_the_report_names_the_axis_that_decides_and_not_one_with_more_noise():
-    criticism = repeated((1.0, 1.0), noise=np.array([0.3, 0.01]), error=(0.0, 0.02)).criticism
+    noise = np.array([0.3, 0.01])
+    criticism = criticise(*repeated((1.0, 1.0), noise, error=(0.0, 0.02))).criticism
     assert criticism.judged["a"].before > criticism.judged["b"].before
     words, _ = verdict(Material("x", criticism=criticism))
     assert f"wrong by {shown(criticism.judged['b'].before)} of the torque of b" in words
     assert "torque of a" not in words
+
+
+@pytest.mark.parametrize("judged", ["unseen", "all"])
+def test_noise_that_an_axis_is_judged_with_is_not_called_unknown(judged):
+    """One sweep, which does not repeat, is among what fits see; b may move in that alone."""
+    both = (1.0, 1.0)
+    recording, model = repeated(
+        both if judged == "unseen" else (1.0, 0.0), noise=0.02, error=(0.0, 0.0)
+    )
+    time = recording.experiments[0].time
+    position, torque = swinging(time, both, np.random.default_rng(7))
+    torque += 0.01 * np.random.default_rng(8).standard_normal(torque.shape)
+    sweep = Experiment(
+        "s", "stepped_sine", ("b",), (), None, time + 40, position, torque, position_reference=None
+    )
+    recording = replace(recording, experiments=(*recording.experiments, sweep))
+    criticism = criticise(recording, model).criticism
+    assert criticism.judged["a"].noise is not None
+    assert criticism.judged["b"].data == judged
+    unknown = [n for n in criticism.notes if "is not known" in n]
+    if judged == "unseen":
+        assert not unknown
+    else:
+        assert unknown == [
+            "Not every stretch that is compared holds a period twice, so the noise of b is not known: "
+            "what is not explained may in part be noise."
+        ]
 
 
 CAUSE = Cause("coulomb_friction", "a", "motor", {}, "", 0.16, 1e-9)
