@@ -140,6 +140,10 @@ def random_machine(rng: np.random.Generator) -> tuple[dict[str, Any], str]:
             effects.append({"effect": "backlash", "joint": 1, "play": 0.002})
         backlash = any(one["effect"] == "backlash" for one in effects)
         more = _one_thing_more(rng) if rng.random() < 0.5 else None
+        if more and more["effect"] == "cogging":
+            # friction holds it where it begins: else it leaves before its drive is enabled
+            more["torque"] = min(more["torque"], torque)
+            more = more if torque else None
         if more:
             if more["effect"] == "gravity":  # what its loops hold when its brake opens
                 more["torque"] = min(
