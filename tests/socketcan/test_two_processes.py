@@ -11,6 +11,7 @@ import time
 
 import numpy as np
 import pytest
+import yaml
 
 from drives.bus.kernel_sync import LEASE
 from drives.canopen_drive import connect
@@ -20,6 +21,8 @@ from fieldtool.cli.main import main
 from fieldtool.records.recording import load
 from tests.socketcan.conftest import ARM, CYCLE, MACHINE, PATIENCE, TABLE, link
 
+STOPPED, TAKEN_BACK = 4, 6
+"""Exit codes: stopped for safety; a write that was taken back."""
 HOST, HEARTBEAT_LOST = 0x77F, 0x8130
 SLACK = 0.1
 """Seconds that a guest with one slow processor may add to a drive's time."""
@@ -169,27 +172,43 @@ def test_an_interface_that_goes_down_in_a_sweep(
 
 
 def test_the_whole_job(drives, listener, tmp_path) -> None:
-    """``fieldtool run`` in a process of its own: identified, written, read back.
+    """``fieldtool run`` in a process of its own: identified, tried, written, tried again, read back.
 
     The drives may miss their host for longer here, for a guest on a busy computer stands still for
-    some 0.15 s again and again.  Without the trials of old and new loops: an axis whose targets stand
-    still for so long in a move and then go on swings, and is rightly stopped.
+    some 0.15 s again and again, master or drives.  In a move of a trial an axis swings then and is
+    rightly stopped, and the drives get back what they held: the rest is done without trials.
     """
     out, machine = tmp_path / "session", tmp_path / "machine.yaml"
     patient = MACHINE.read_text().replace("bus: {", "bus: {host_lost_after: 800 ms, ")
     machine.write_text(patient, encoding="utf-8")
-    command = [sys.executable, "-m", "fieldtool", "run", str(machine), "--write", "--yes"]
-    run = subprocess.run(
-        [*command, "--no-verify", "--json", "--out", str(out)],
-        capture_output=True,
-        text=True,
-        timeout=3 * PATIENCE,
-        check=False,
-    )
-    print(run.stderr)
+
+    def fieldtool(*arguments: str) -> "subprocess.CompletedProcess[str]":
+        done = subprocess.run(
+            [sys.executable, "-m", "fieldtool", *arguments, "--yes", "--json"],
+            capture_output=True,
+            text=True,
+            timeout=3 * PATIENCE,
+            check=False,
+        )
+        print(done.stderr)
+        return done
+
+    def held() -> list[int]:
+        return [listener.read(node, 0x2010, sub) for node in (TABLE, ARM) for sub in (1, 2, 3)]
+
+    before = held()
+    run = fieldtool("run", str(machine), "--write", "--out", str(out))
+    assert re.search(r"This computer began \d+ of \d+ cycles", " ".join(run.stderr.split()))
+    if run.returncode in (STOPPED, TAKEN_BACK) and "Try the old parameters" in run.stderr:
+        assert held() == before
+        assert not listener.enabled(TABLE)
+        assert not listener.enabled(ARM)
+        print("a trial was stopped: written without one")
+        run = fieldtool("write", str(out), "--no-verify")
     assert run.returncode == 0, run.stderr
     result = json.loads(run.stdout)
-    axes = {axis["name"]: axis for axis in result["model"]["axes"]}
+    model = yaml.safe_load((out / "model.yaml").read_text(encoding="utf-8"))
+    axes = {axis["name"]: axis for axis in model["axes"]}
     found = [m["value"] for m in axes["table"]["masses"]]
     assert found == pytest.approx([2.0, 3.0], rel=0.02)
     assert axes["arm"]["masses"][0]["value"] == pytest.approx(4.0, rel=0.02)
@@ -200,6 +219,4 @@ def test_the_whole_job(drives, listener, tmp_path) -> None:
         assert not listener.enabled(node)
         assert listener.read(node, 0x1016, 1) == 0, "put back"
     events = [json.loads(line) for line in (out / "events.jsonl").read_text().splitlines()]
-    (cycles,) = (e for e in events if e["event"] == "cycles")
-    assert cycles["count"] > 1000
-    assert re.search(r"This computer began \d+ of \d+ cycles", " ".join(run.stderr.split()))
+    assert max(e["count"] for e in events if e["event"] == "cycles") > 1000
