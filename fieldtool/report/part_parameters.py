@@ -7,6 +7,7 @@ from typing import Any
 from fieldtool.design.tuning import Tuning
 from fieldtool.report.material import Material
 from fieldtool.report.section import Block, Section, Table, Words
+from fieldtool.writeback.earlier import FIRST_BACKUP
 
 ROUNDED = 1e-2
 """Relative difference that comes of what drives can hold."""
@@ -95,8 +96,10 @@ def _state(material: Material) -> str:
     if last.get("event") == "restored":
         without = last.get("without")
         but = ", ".join(map(str, without)) if isinstance(without, list) else ""
+        backup = last.get("backup", FIRST_BACKUP)
+        old = "the old ones were" if backup == FIRST_BACKUP else f"what {backup} holds was"
         return (
-            "Written into the drives and read back; afterwards the old ones were brought back "
+            f"Written into the drives and read back; afterwards {old} brought back "
             f"(`fieldtool restore`){f', but for {but}' if but else ''}."
         )
     if written[-1].get("stored"):

@@ -319,8 +319,10 @@ def restore(
             without=without,
             say=screen.say,
         )
-    if backup.is_dir():
-        SessionFolder(backup).note("restored", stored=store, without=sorted(without))
+    folder = SessionFolder(source.backup_path.parent)
+    if backup.is_dir() or folder.events.is_file():  # a file may lie anywhere
+        name = source.backup_path.name
+        folder.note("restored", stored=store, without=sorted(without), backup=name)
     return restored
 
 

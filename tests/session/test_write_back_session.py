@@ -524,6 +524,36 @@ def test_restore_brings_back_objects_that_the_tool_never_writes(session):
     assert session.changed() == {}
 
 
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("parameters-before.yaml", "afterwards the old ones were brought back"),
+        (
+            "parameters-before-2.yaml",
+            "afterwards what parameters-before-2.yaml holds was brought back",
+        ),
+    ],
+)
+def test_the_report_knows_of_a_restore_from_a_file_of_the_session(session, name, said):
+    assert write(session).code == 0
+    write_tuning(session, {"velocity_p": 3.0})
+    assert write(session).code == 0
+    assert session.command("restore", session.out / name).code == 0
+    assert session.command("report", session.out).code == 0
+    text = re.sub(r"<[^>]*>|\s+", " ", (session.out / "report.html").read_text(encoding="utf-8"))
+    assert said in text
+
+
+def test_a_restore_from_a_file_elsewhere_leaves_no_log_there(session):
+    assert write(session).code == 0
+    elsewhere = session.folder / "elsewhere"
+    elsewhere.mkdir()
+    copy = elsewhere / "backup.yaml"
+    copy.write_bytes((session.out / "parameters-before.yaml").read_bytes())
+    assert session.command("restore", copy, "--machine", session.profile).code == 0
+    assert not (elsewhere / "events.jsonl").exists()
+
+
 def test_a_backup_of_another_drive_is_refused(session, make_bench):
     write(session)
     backup = session.out / "parameters-before.yaml"
