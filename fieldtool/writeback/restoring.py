@@ -228,7 +228,7 @@ def bring_back(
         with keeper:
             transaction.restore()
     except OSError as error:
-        raise not_kept(keeper, error) from error
+        raise not_kept(keeper, error, back=_made_writable(cut_off)) from error
     except (UserStopError, KeyboardInterrupt):
         keeper.settle(transaction.journal)
         raise
@@ -246,6 +246,14 @@ def bring_back(
         left_out=tuple(p.axis for p in source.backup.drives if p.axis in without),
         notes=tuple(notes),
     )
+
+
+def _made_writable(cut_off: Journal | None) -> str:
+    """Say what to do about a session folder that can not be written."""
+    advice = "Make the folder writable and make room on its disk"
+    if cut_off is None:
+        advice += ", or copy it to where that is so and restore the copy"
+    return f"{advice}. Then restore again."
 
 
 def _without_set_up(backup: Backup) -> Backup:

@@ -126,12 +126,21 @@ class JournalKeeper:
                     remove_durably(note)
 
 
-def not_kept(keeper: JournalKeeper, error: OSError) -> OutputError:
-    """Return the refusal to write without a journal."""
+def not_kept(keeper: JournalKeeper, error: OSError, *, back: str = "") -> OutputError:
+    """Return the refusal to write without a journal.
+
+    ``back``: what to do about the session folder where it is to be restored; there is no other one.
+    """
+    where = Path(error.filename or keeper.path)
+    advice = back or "Make the folder writable, make room, or choose another folder."
+    if where.resolve().parent != keeper.path.resolve().parent:
+        advice = (
+            "Make that folder writable, make room, or name another one for the notes in "
+            f"{STATE_VARIABLE}."
+        )
     return OutputError(
-        f"{error.filename or keeper.path}: the journal of the write can not be kept "
-        f"({error.strerror or error}). Without it nothing is written to the drives. Make room, choose "
-        f"another folder, or name one for the notes in {STATE_VARIABLE}."
+        f"{where}: the journal of the write can not be kept ({error.strerror or error}). Without it "
+        f"nothing is written to the drives. {advice}"
     )
 
 

@@ -153,6 +153,39 @@ def test_a_journal_that_can_not_be_kept_means_that_nothing_is_written(session, m
     assert session.changed() == {}
 
 
+def test_a_restore_whose_journal_can_not_be_kept_says_what_helps(session, monkeypatch):
+    """There is no other folder to choose: what is to be restored is in this one."""
+    assert session.command("write", session.out, "--yes").code == 0
+    copy = session.folder / "copy"
+    shutil.copytree(session.out, copy)
+    (session.out / "write-journal.yaml.part").mkdir()
+    refused = session.command("restore", session.out)
+    assert refused.code == 3
+    said = in_one_line(refused.err)
+    assert "Make the folder writable and make room on its disk, or copy it to where" in said
+    assert "another folder" not in said
+    assert "FIELDTOOL_STATE_DIR" not in said
+    assert session.command("restore", copy).code == 0
+    assert session.changed() == {}
+    (session.folder / "a file").touch()
+    monkeypatch.setenv("FIELDTOOL_STATE_DIR", str(session.folder / "a file"))
+    said = in_one_line(session.command("restore", copy).err)
+    assert "name another one for the notes in FIELDTOOL_STATE_DIR" in said
+    assert "copy it" not in said
+
+
+def test_a_restore_of_what_was_cut_off_does_not_advise_a_copy(session, cut_off):
+    """A copy is refused as long as the folder itself has the open journal."""
+    cut_off(PER_DRIVE)
+    (session.out / "write-journal.yaml.part").mkdir()
+    refused = session.command("restore", session.out)
+    assert refused.code == 3
+    said = in_one_line(refused.err)
+    assert "Make the folder writable and make room on its disk. Then restore again." in said
+    (session.out / "write-journal.yaml.part").rmdir()
+    assert session.command("restore", session.out).code == 0
+
+
 def test_a_disk_that_fills_up_in_the_middle_takes_everything_back(session):
     part = session.out / "write-journal.yaml.part"
     session.machine.node(ARM).dictionary.guards[VELOCITY_P] = lambda _: part.mkdir(exist_ok=True)
