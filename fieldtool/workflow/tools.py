@@ -1,7 +1,7 @@
 """Tool set-ups of one machine: keep their parameters by name, compare them, switch between them."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from drives.canopen_drive.group import profile_of
@@ -137,6 +137,8 @@ def switch_tool(
             session.screen.say,
             stop_requested=stop_requested,
         )
+        if tool.verified:
+            result = replace(result, to_store="the same command with --store")
         session.write_back = result
         session.folder.note("parameters", rows=parameter_table(result))
         session.folder.note("tool", name=name, written=result.in_memory, stored=result.stored)

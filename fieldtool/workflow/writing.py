@@ -1,13 +1,14 @@
 """Bring a tuning into the drives, and try it there: only what has stood its trial may be stored."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 from drives.canopen_drive import CanopenGroup
 from drives.canopen_drive.interrupts import uninterrupted
 from drives.errors import STOPPED_AT_REST, NotSupportedError, ProfileError, UserStopError
 from drives.parameters import Change, load_journal
 from drives.parameters.journal import State
-from fieldtool.design.tuning import Tuning
+from fieldtool.design.tuning import Tuning, why_not_stored
 from fieldtool.errors import OutputError, PlanRefusedError
 from fieldtool.records.model import MachineModel
 from fieldtool.workflow.session import Options, Session, parameter_table
@@ -77,9 +78,10 @@ def written(
             "away. Nothing was written."
         )
     refuse_other_drives(session.folder.parameters_before, group.drives)
-    verification = None
+    verification, never = None, why_not_stored(tuning.bound, identified=believed)
     if options.verify:
         verification = Verification(session, group, tuning, model, believed=believed)
+        never = verification.not_stored
         if verification.not_stored and options.store:
             raise PlanRefusedError(
                 f"the new parameters are not stored: {verification.not_stored}. Leave --store away to "
@@ -120,6 +122,9 @@ def written(
                 verification.ended(error, _held_after(session))
         raise
     with uninterrupted():  # a stop waits until it stands in the folder what the drives hold
+        if not never:
+            keep = f"`fieldtool write {session.folder.path} --store`, which tries them once more"
+            result = replace(result, to_store=keep)
         session.write_back = result
         if verification is not None:
             verification.ended(None, State.NEW if result.in_memory else State.OLD)

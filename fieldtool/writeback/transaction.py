@@ -49,6 +49,8 @@ class WriteBack:
     stored: bool
     """The new values survive a power cycle."""
     backup: Path | None
+    to_store: str = ""
+    """What stores the new values that are in working memory; empty where nothing does."""
 
     @property
     def sentence(self) -> str:
@@ -57,9 +59,10 @@ class WriteBack:
             return "Nothing was written: the drives hold their old parameters."
         if self.stored:
             return "The new parameters are in the drives and stored: they survive a power cycle."
+        keep = f" To keep them: {self.to_store}." if self.to_store else ""
         return (
             "The new parameters are in the drives' working memory only: a power cycle brings the old "
-            "ones back. Use --store to keep them."
+            f"ones back.{keep}"
         )
 
     @property

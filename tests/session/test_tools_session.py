@@ -54,6 +54,7 @@ def test_sets_are_kept_compared_and_switched_there_and_back(session, tmp_path):
     assert back.code == 0, back.err
     assert session.changed() == {}, "bit by bit what it was"
     assert "was not tried" in " ".join((back.out + back.err).split())
+    assert "--store" not in back.out
     again = tools(session, "switch", "gripper", "--yes", "--out", tmp_path / "two")
     assert again.code == 0, again.err
     assert {node: gain(session, node) for node in (TABLE, ARM)} == new
@@ -72,6 +73,8 @@ def test_a_set_that_stood_its_trial_says_so_and_may_be_stored(session, tmp_path)
     assert json.loads(kept.out)["verified"] is True
     assert json.loads(kept.out)["figures"]["table"]["sensitivity_peak"] < 2.1
     assert session.command("restore", session.out).code == 0
+    switched = tools(session, "switch", "gripper", "--yes", "--out", tmp_path / "one")
+    assert "To keep them: the same command with --store." in " ".join(switched.out.split())
     stored = tools(session, "switch", "gripper", "--yes", "--store", "--out", tmp_path / "one")
     assert stored.code == 0, stored.err
     for node in session.machine.nodes:

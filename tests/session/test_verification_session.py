@@ -94,6 +94,21 @@ def test_good_parameters_are_tried_kept_and_compared_on_one_scale(session):
     assert (session.out / "verification.png").stat().st_size > 10_000
 
 
+def test_what_was_written_is_stored_by_the_command_that_is_named(session):
+    said = " ".join(write(session).out.split())
+    command = re.search(r"To keep them: `fieldtool ([^`]*)`", said)
+    assert command is not None, said
+    new, was = session.objects()[TABLE][VELOCITY_P], session.before[TABLE][VELOCITY_P]
+    assert new != was
+    stored = session.command(*command[1].split(), "--yes")
+    assert stored.code == 0, stored.err
+    for node in session.machine.nodes:
+        node.power_cycle()
+    assert session.objects()[TABLE][VELOCITY_P] == new
+    assert session.command("restore", session.out, "--store").code == 0
+    assert session.objects()[TABLE][VELOCITY_P] == was
+
+
 def test_dry_friction_in_the_model_is_reckoned_with_in_the_trial(make_bench, profile_of_two):
     """It rules settling, and hides the loop from a small excitation: both are predicted."""
     share = 0.05
@@ -666,6 +681,10 @@ def test_a_bound_above_the_usual_one_is_said_and_never_stored(session):
     assert "CAREFUL" in " ".join((told.out + told.err).split())
     assert not [f for f in session.heard() if f.cob_id == 0x80], "no SYNC: nothing moved"
     assert session.changed() == {}
+    untried = write(session, "--no-verify")
+    assert untried.code == 0, untried.err
+    assert "working memory only" in " ".join(untried.out.split())
+    assert "--store" not in untried.out
 
 
 def test_another_machines_model_foretells_nothing(session):
