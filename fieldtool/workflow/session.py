@@ -16,13 +16,14 @@ from drives.profile import MachineProfile, load_machine
 from drives.trace import trace_problem
 from fieldtool.criticise.criticism import Criticism
 from fieldtool.design.tuning import Tuning
-from fieldtool.errors import OutputError
+from fieldtool.errors import FieldtoolError, OutputError
 from fieldtool.experiment.forecast import AxisForecast
 from fieldtool.experiment.multisine.runner import MultisineProgress
 from fieldtool.experiment.stepped.plan import SweepPlan
 from fieldtool.experiment.stepped.runner import Progress
 from fieldtool.identify.recorded import Identified
 from fieldtool.records.model import MachineModel
+from fieldtool.records.recording import load
 from fieldtool.records.session_folder import SessionFolder
 from fieldtool.records.yaml_file import write_yaml
 from fieldtool.workflow.planning import PlannedFast
@@ -273,11 +274,26 @@ def open_session(
         if session.write_back is not None and session.write_back.way_back:
             error.add_note(session.write_back.way_back)
         if not keep_profile and folder.recording.is_file():
-            error.add_note(
-                f"What was measured is kept in {folder.path}: `fieldtool report {folder.path}` shows it."
-            )
+            error.add_note(_kept(folder))
         raise
     folder.note("ended")
+
+
+def _kept(folder: SessionFolder) -> str:
+    """Say where a session that an error has ended left its data, and whether they are of use."""
+    words = (
+        f"What was measured is kept in {folder.path}: `fieldtool report {folder.path}` shows it."
+    )
+    try:
+        experiments = load(folder.recording).experiments
+    except FieldtoolError:
+        return words
+    if any(one.complete and one.kind in ("multisine", "stepped_sine") for one in experiments):
+        return words
+    return (
+        f"{words} No whole experiment that excites the axes is in it, so no machine can be identified "
+        "from it: measure again, into another folder."
+    )
 
 
 def resolved(profile: MachineProfile) -> dict[str, Any]:

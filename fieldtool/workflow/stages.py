@@ -96,6 +96,7 @@ def run(
     options = options or Options()
     begin = time.perf_counter()
     opened: Session | None = None
+    whole = False
     try:
         with open_session(machine, out, screen, stop_requested, command="run", options=options) as (
             session,
@@ -103,6 +104,7 @@ def run(
         ):
             opened = session
             machine_time = _measured(session, group, options)
+            whole = True
             identified = _identify(session, options)
             session.screen.found(identified.model, truth_model(session.machine))
             model, criticism = criticised(session, identified.model, stop_requested)
@@ -125,10 +127,13 @@ def run(
                 believed=True,
                 ask_to_move=False,
             )
-    except BaseException:
+    except BaseException as error:
         if opened is not None and opened.folder.recording.is_file():
             with suppress(Exception):  # nothing may hide why it ended
                 report(opened.folder.path)
+            stopped = isinstance(error, UserStopError | KeyboardInterrupt)
+            if whole and stopped and opened.write_back is None:
+                error.add_note(_rest_of(opened.folder, options))
         raise
     with noting(write_back.way_back):
         _reported(session)
@@ -324,6 +329,20 @@ def restore(
         name = source.backup_path.name
         folder.note("restored", stored=store, without=sorted(without), backup=name)
     return restored
+
+
+def _rest_of(folder: SessionFolder, options: Options) -> str:
+    """Return the commands that do what a run that was stopped has left undone."""
+    motors = " --motor-inertia data-sheet" if options.motor_inertia == "data sheet" else ""
+    response = f" --response {options.response}" if options.response != "normal" else ""
+    stages = (
+        (folder.model, f"`fieldtool identify {folder.path}{motors}`, "),
+        (folder.criticism, f"`fieldtool criticise {folder.path}`, "),
+        (folder.tuning, f"`fieldtool design {folder.path}{response}`, then "),
+    )
+    made = max((k + 1 for k, (file, _) in enumerate(stages) if file.is_file()), default=0)
+    left = "".join(command for _, command in stages[made:])
+    return f"To go on without measuring again: {left}`fieldtool write {folder.path}`."
 
 
 def _rescued(folder: SessionFolder, screen: Screen) -> None:

@@ -1,11 +1,19 @@
 """Bring a tuning into the drives, and try it there: only what has stood its trial may be stored."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 
 from drives.canopen_drive import CanopenGroup
 from drives.canopen_drive.interrupts import uninterrupted
-from drives.errors import STOPPED_AT_REST, NotSupportedError, ProfileError, UserStopError
+from drives.errors import (
+    STOPPED_AT_REST,
+    NotSupportedError,
+    OscillationError,
+    ProfileError,
+    StoppedError,
+    UserStopError,
+)
 from drives.parameters import Change, load_journal
 from drives.parameters.journal import State
 from fieldtool.design.tuning import Tuning, why_not_stored
@@ -94,15 +102,16 @@ def written(
         verification.plan(changes_for(group.drives, tuning))
 
     def agreed(changes: Sequence[Change]) -> bool:
-        if not confirm(changes):
-            return False
-        if verification is not None:
-            if ask_to_move and not session.ready():
-                raise UserStopError("not begun: nothing was moved or written")
-            verification.before()
-        _forget_earlier(session)
-        session.screen.stage("Write the new parameters, and read them back")
-        return True
+        with _before_the_write():
+            if not confirm(changes):
+                return False
+            if verification is not None:
+                if ask_to_move and not session.ready():
+                    raise UserStopError("not begun: nothing was moved")
+                verification.before()
+            _forget_earlier(session)
+            session.screen.stage("Write the new parameters, and read them back")
+            return True
 
     try:
         result = apply(
@@ -135,6 +144,17 @@ def written(
     if result.in_memory and verification is None:
         session.warn("The new parameters were not tried on the machine (--no-verify).")
     return result, verification.result if verification else None
+
+
+@contextmanager
+def _before_the_write() -> Iterator[None]:
+    """Have whatever stops the work here say that nothing was written."""
+    try:
+        yield
+    except StoppedError as error:
+        if not isinstance(error, OscillationError):  # which says so
+            error.add_note("That was before the write: nothing was written.")
+        raise
 
 
 def _forget_earlier(session: Session) -> None:

@@ -1,6 +1,7 @@
 """Ctrl-C at every stage: exit code 130, axes disabled, drives as they were, data kept."""
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -136,6 +137,47 @@ def test_between_measuring_and_writing(small_bench, monkeypatch, module, name, c
     is_safe(small_bench)
     assert small_bench.stored() == {TABLE: {}}
     assert small_bench.recording().experiments[-1].complete, "the data are kept"
+
+
+@pytest.mark.usefixtures("quick_plan", "untried")
+@pytest.mark.parametrize(
+    ("module", "name", "left"),
+    [
+        ("stages", "identify_recording", ["identify", "criticise", "design", "write"]),
+        ("stages", "criticised", ["criticise", "design", "write"]),
+        ("stages", "designed", ["design", "write"]),
+        ("writing", "apply", ["write"]),
+    ],
+)
+def test_what_a_stop_left_undone_is_done_by_the_commands_that_are_named(
+    small_bench, monkeypatch, module, name, left
+):
+    monkeypatch.setattr(import_module("fieldtool.cli.stop_key"), "ASKED_WITHIN", -1.0)
+    pressing_during(monkeypatch, import_module(f"fieldtool.workflow.{module}"), name)
+    outcome = small_bench.run("--write", "--yes", "--response", "soft")
+    assert outcome.code == 130, outcome.err
+    assert "No whole experiment" not in outcome.err
+    told = " ".join(outcome.err.split()).partition("To go on without measuring again: ")[2]
+    commands = [command.split() for command in re.findall(r"`fieldtool ([^`]*)`", told)]
+    assert [command[0] for command in commands] == left
+    for command in commands:
+        answers = ("--yes",) if command[0] == "write" else ()
+        again = small_bench.command(*command, *answers)
+        assert again.code == 0, again.err
+    assert "response: soft" in (small_bench.out / "tuning.yaml").read_text()
+    assert small_bench.changed() != {}
+
+
+@pytest.mark.parametrize("plan", ["fast", "classic"])
+def test_data_of_a_stopped_direction_check_are_said_to_be_of_no_use(bench, plan):
+    bench.inject(Pressed(TABLE), CHECKING // 2)
+    outcome = bench.run("--write", "--yes", plan=plan)
+    assert outcome.code == 130
+    said = " ".join(outcome.err.split())
+    assert "no machine can be identified from it: measure again, into another folder." in said
+    assert "To go on" not in said
+    assert bench.command("identify", bench.out).code == 5
+    is_safe(bench)
 
 
 @pytest.mark.usefixtures("quick_plan", "untried")

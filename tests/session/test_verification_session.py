@@ -24,6 +24,7 @@ from fieldtool.records.recording import load
 from fieldtool.records.session_folder import SessionFolder
 from fieldtool.workflow import verifying
 from fieldtool.workflow.rescued import rescue
+from tests.session.test_stopped_by_user import Pressed
 from tests.session.test_trial import Gains
 from tests.tunings import GOOD, begun, scale_model, write_tuning
 from tests.untried import Stood
@@ -547,6 +548,15 @@ def test_ctrl_c_while_the_verdict_is_kept_loses_nothing(session, monkeypatch):
     assert (session.out / "verification.png").stat().st_size > 0
     assert session.command("restore", session.out, "--store").code == 0
     assert session.changed() == {}
+
+
+def test_ctrl_c_in_the_trial_of_the_old_parameters_says_that_nothing_was_written(session):
+    session.inject(Pressed(TABLE), 500)
+    outcome = write(session)
+    assert outcome.code == 130
+    assert "nothing was written" in " ".join(outcome.err.split())
+    assert session.changed() == {}
+    assert session.powered() == {}
 
 
 class Interrupted(Stood):
