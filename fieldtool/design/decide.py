@@ -8,7 +8,7 @@ import numpy as np
 
 from fieldtool.design.design import Advance, Softer, Task, find
 from fieldtool.design.drive_side import DriveSide
-from fieldtool.design.given_up import given_up
+from fieldtool.design.given_up import STIFFEST, given_up, no_sooner
 from fieldtool.design.held import held
 from fieldtool.design.loops import Loops, system_matrix
 from fieldtool.design.machine import Machine, machine_of, respond
@@ -118,8 +118,7 @@ def design(
             if name == response:
                 raise
             continue  # what is softer may ask for too much
-        widths = tuple(axis.margins.bandwidth for axis in result.prediction.axes)
-        softer = Softer(result.servos, widths, result.instead or name)
+        softer = Softer(result.servos, result.prediction, result.instead or name)
     return _tuning(result, response)
 
 
@@ -184,6 +183,7 @@ def _as_soft(task: Task, softer: Softer) -> _Result:
 
 def _tuning(result: _Result, response: str) -> Tuning:
     task, servos, prediction, kept = result.task, result.servos, result.prediction, result.kept
+    softer = task.softer
     axes = []
     now = task.present
     present = predicted(task, now, spread=False) if now else None
@@ -202,6 +202,8 @@ def _tuning(result: _Result, response: str) -> Tuning:
         notes += drive_notes(side, axis, {} if k in kept else parameters)
         if now and present and present.stable and k not in kept:
             notes += given_up(side, axis, present.axes[k], (servo, now[k]), response)
+        if response == STIFFEST and softer is not None and servo != softer.servos[k]:
+            notes += no_sooner(side, axis, softer.prediction.axes[k], (response, softer.name))
     if kept:
         names = ", ".join(task.sides[k].axis for k in sorted(kept))
         notes.append(f"{names}: {KEPT}")

@@ -21,7 +21,7 @@ from fieldtool.design.grids import FAR_GAIN, Bounds, Grids, grids_of
 from fieldtool.design.loops import Loops, system_matrix
 from fieldtool.design.machine import Machine, respond
 from fieldtool.design.moves import TestMove
-from fieldtool.design.predict import frequencies
+from fieldtool.design.predict import Prediction, frequencies
 from fieldtool.design.robust import (
     FRESH,
     MAY_FAIL,
@@ -71,10 +71,15 @@ class Softer:
     """What a softer response came to; this one is to be no slower on any axis."""
 
     servos: tuple[Servo, ...]
-    bandwidths: tuple[float, ...]
-    """Hz, of the model's machine."""
+    prediction: Prediction
+    """On the model's machine."""
     name: str
     """Of the response."""
+
+    @property
+    def bandwidths(self) -> tuple[float, ...]:
+        """Hz, an axis each."""
+        return tuple(axis.margins.bandwidth for axis in self.prediction.axes)
 
 
 @dataclass(eq=False)

@@ -1,9 +1,14 @@
-"""What an axis gives up for settling sooner: the path that it follows, and stiffness; sentences."""
+"""What an axis gives up for settling sooner: the path that it follows, and stiffness; sentences.
+
+Also where a stiffer response brings no sooner settling.
+"""
+
+from math import inf, isfinite
 
 from drives.units import unit_on
 from fieldtool.design.drive_side import UNITS, DriveSide
 from fieldtool.design.figures import strays
-from fieldtool.design.no_worse import SOFTER, softer_than
+from fieldtool.design.no_worse import SOFTER, TICK, arrival, softer_than
 from fieldtool.design.predict import AxisPrediction
 from fieldtool.design.servo import Servo
 
@@ -31,6 +36,34 @@ def given_up(
         That was asked for.
     """
     return _path(side, new, was) + _stiffness(side, new, was, servos, response)
+
+
+def no_sooner(
+    side: DriveSide, new: AxisPrediction, softer: AxisPrediction, names: tuple[str, str]
+) -> list[str]:
+    """Return a sentence where a stiffer response does not arrive sooner than a softer one.
+
+    Parameters
+    ----------
+    side
+        The drive.
+    new, softer
+        What the axis does with the two.
+    names
+        Of the two responses.
+    """
+    times = arrival(new), arrival(softer)
+    if not isfinite(times[0]) or times[0] < times[1] - TICK:
+        return []
+    steps = [inf if one.step is None else one.step.settling_time for one in (new, softer)]
+    step = f", after a step {steps[0]:.3g} s, {steps[1]:.3g} s" if isfinite(sum(steps)) else ""
+    unit = unit_on(side.kind, "rad/(N m)")
+    return [
+        f"{side.axis}: {names[0]} settles no sooner than {names[1]} here: {times[0]:.3g} s from the "
+        f"beginning of its typical move, {times[1]:.3g} s with {names[1]}{step}; a torque or force "
+        f"moves its motor by up to {new.compliance:.3g} {unit}, {softer.compliance:.3g} {unit}. Where "
+        f"that does not matter, --response {names[1]} keeps more margin."
+    ]
 
 
 def _path(side: DriveSide, new: AxisPrediction, was: AxisPrediction) -> list[str]:

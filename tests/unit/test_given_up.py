@@ -5,13 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fieldtool.design.decide import design
 from fieldtool.design.design import Task
 from fieldtool.design.drive_side import DriveSide
 from fieldtool.design.figures import STRAYS, strays
-from fieldtool.design.given_up import given_up
+from fieldtool.design.given_up import given_up, no_sooner
 from fieldtool.design.machine import machine_of
 from fieldtool.design.moves import typical_move
-from fieldtool.design.no_worse import SOFTER, arrival, no_worse, predicted
+from fieldtool.design.no_worse import SOFTER, TICK, arrival, no_worse, predicted
 from fieldtool.design.predict import AxisPrediction
 from fieldtool.design.servo import Servo, Timing
 from fieldtool.design.start import slower
@@ -114,3 +115,37 @@ def test_without_feed_forward_the_path_is_said_to_be_left() -> None:
     now, was = (predicted(task, (one,), spread=False).axes[0] for one in (late, PRESENT))
     [told] = given_up(task.sides[0], now, was, (late, PRESENT), "stiff")
     assert told.startswith("x: on its typical move the motor is up to ")
+
+
+@pytest.mark.parametrize("kind", ["rotary", "linear"])
+def test_a_stiff_response_that_settles_no_sooner_says_so(kind: str) -> None:
+    task = task_of(kind)
+    new, was = both(task, PRESENT)
+    assert new.move is not None
+    for ticks, said in ((-1.01, False), (-0.99, True), (0.0, True), (5.0, True)):
+        later = new.move.positioning_time + ticks * TICK
+        one = replace(new, load=None, move=replace(new.move, positioning_time=later))
+        one = replace(one, load=one.move)
+        told = no_sooner(task.sides[0], one, replace(was, load=was.move), ("stiff", "normal"))
+        assert bool(told) == said
+    unit = {"rotary": "rad/(N m)", "linear": "m/N"}[kind]
+    assert f"{was.compliance:.3g} {unit}. Where" in told[0]
+    assert told[0].endswith("--response normal keeps more margin.")
+    away = replace(new, move=None)
+    assert no_sooner(task.sides[0], away, was, ("stiff", "normal")) == []
+
+
+def test_a_design_says_where_stiff_settles_no_sooner() -> None:
+    """A rigid axis with feed-forward is there when its reference is, whatever the gains."""
+    task = task_of()
+    told = {
+        name: [
+            note
+            for note in design(task.model, task.sides, task.moves, response=name).notes
+            if "no sooner than" in note
+        ]
+        for name in ("normal", "stiff")
+    }
+    assert told["normal"] == []
+    [note] = told["stiff"]
+    assert note.startswith("x: stiff settles no sooner than normal here: ")
