@@ -9,11 +9,13 @@ import typer
 from rich.console import Console
 from rich.text import Text
 
+from drives.units import Kind, unit_on
 from fieldtool import workflow
 from fieldtool.cli.options import ResponseChoice, check_response
 from fieldtool.cli.output import Json, console_of, indented, print_json
 from fieldtool.cli.progress import ShareBar
 from fieldtool.cli.sheet import Sheet
+from fieldtool.design.drive_side import UNITS
 from fieldtool.design.predict import AxisPrediction
 from fieldtool.design.tuning import BOUND, MOST_BOUND, Tuning
 from fieldtool.design.tuning_file import tuning_as_dict
@@ -30,22 +32,22 @@ def _load(name: str) -> Figure:
     return lambda one: None if one.load is None else float(getattr(one.load, name))
 
 
-ROWS: tuple[tuple[str, float, Figure], ...] = (
-    ("peak of sensitivity", 1, lambda one: one.margins.sensitivity_peak),
-    ("phase margin, degrees", 1, lambda one: one.margins.phase_margin),
-    ("delay margin, ms", 1e3, lambda one: one.margins.delay_margin),
-    ("bandwidth, Hz", 1, lambda one: one.margins.bandwidth),
-    ("move: following error", 1, _motor("following_error")),
-    ("move: overshoot", 1, _motor("overshoot")),
-    ("move: settling, s", 1, _motor("settling_time")),
-    ("last mass: settling, s", 1, _load("settling_time")),
-    ("last mass: vibration", 1, _load("residual_rms")),
-    ("move: torque", 1, lambda one: one.peak_torque),
-    ("step: settling, s", 1, lambda one: None if one.step is None else one.step.settling_time),
-    ("compliance", 1, lambda one: one.compliance),
-    ("noise of torque", 1, lambda one: one.noise),
+ROWS: tuple[tuple[str, str, float, Figure], ...] = (
+    ("peak of sensitivity", "", 1, lambda one: one.margins.sensitivity_peak),
+    ("phase margin", "degrees", 1, lambda one: one.margins.phase_margin),
+    ("delay margin", "ms", 1e3, lambda one: one.margins.delay_margin),
+    ("bandwidth", "Hz", 1, lambda one: one.margins.bandwidth),
+    ("move: following error", "rad", 1, _motor("following_error")),
+    ("move: overshoot", "rad", 1, _motor("overshoot")),
+    ("move: settling", "s", 1, _motor("settling_time")),
+    ("last mass: settling", "s", 1, _load("settling_time")),
+    ("last mass: vibration", "rad", 1, _load("residual_rms")),
+    ("move: torque", "N m", 1, lambda one: one.peak_torque),
+    ("step: settling", "s", 1, lambda one: None if one.step is None else one.step.settling_time),
+    ("compliance", "rad/(N m)", 1, lambda one: one.compliance),
+    ("noise of torque", "N m", 1, lambda one: one.noise),
 )
-"""Title, scale, figure."""
+"""Title, unit on a rotary axis, scale, figure."""
 
 
 def design(
@@ -71,9 +73,10 @@ def design(
         tuning = workflow.redesign(folder, response, bound, png, bar)
     show_tuning(console, tuning)
     for axis in tuning.axes:
-        console.print(Text(f"{axis.axis} (SI):"))
+        console.print(Text(f"{axis.axis}:"))
         for name, value in axis.parameters.items():
-            console.print(indented(f"{name:22}{value:.6g}"))
+            unit = unit_on(axis.kind, UNITS.get(name, ""))
+            console.print(indented(f"{name:22}{value:.6g} {unit}".rstrip()))
     console.print(Text(f"Kept in {folder}; `fieldtool write {folder}` brings it into the drives."))
     if as_json:
         print_json(tuning_as_dict(tuning))
@@ -91,27 +94,36 @@ def show_tuning(console: Console, tuning: Tuning) -> None:
 
 
 def _tables(tuning: Tuning, width: int) -> list[Sheet]:
-    """Return what is predicted, as many axes side by side as the terminal has room for."""
-    prediction = tuning.prediction
-    axes = prediction.axes if prediction is not None else ()
+    """Return what is predicted, as many axes of a kind side by side as the terminal has room for."""
+    kinds = {axis.axis: axis.kind for axis in tuning.axes}
+    axes = tuning.prediction.axes if tuning.prediction is not None else ()
+    tables = []
+    for kind in dict.fromkeys(kinds.values()):
+        tables += _tables_of(tuning, kind, [a for a in axes if kinds[a.axis] == kind], width)
+    return tables
+
+
+def _tables_of(
+    tuning: Tuning, kind: Kind, axes: Sequence[AxisPrediction], width: int
+) -> list[Sheet]:
     for count in range(len(axes), 0, -1):
-        tables = [_table(tuning, axes[k : k + count]) for k in range(0, len(axes), count)]
+        parts = [axes[k : k + count] for k in range(0, len(axes), count)]
+        tables = [_table(tuning, kind, part) for part in parts]
         if count == 1 or max(table.natural_width for table in tables) <= width:
             return tables
     return []
 
 
-def _table(tuning: Tuning, axes: Sequence[AxisPrediction]) -> Sheet:
-    """Return present and predicted figures of some axes."""
+def _table(tuning: Tuning, kind: Kind, axes: Sequence[AxisPrediction]) -> Sheet:
+    """Return present and predicted figures of some axes of a kind."""
     now = tuning.present
     titles = [title for a in axes for title in ((f"{a.axis} before", "new") if now else (a.axis,))]
-    table = Sheet("predicted (SI)", *titles, numbers=titles)
-    for title, scale, of in ROWS:
+    table = Sheet("predicted", *titles, numbers=titles)
+    for title, unit, scale, of in ROWS:
         shown = [one for axis in axes for one in ((now.of(axis.axis), axis) if now else (axis,))]
-        table.add(
-            title,
-            *(_cell(of(one), scale, AT_ONCE if "settling" in title else "0") for one in shown),
-        )
+        zero = AT_ONCE if "settling" in title else "0"
+        named = f"{title}, {unit_on(kind, unit)}" if unit else title
+        table.add(named, *(_cell(of(one), scale, zero) for one in shown))
     return table
 
 

@@ -198,7 +198,8 @@ def _tuning(result: _Result, response: str) -> Tuning:
         if k in kept and side.present:
             parameters = {n: v for n, v in side.present.items() if n in parameters}
         reason = KEPT if k in kept else _reason(task, k, servo)
-        axes.append(AxisTuning(side.axis, parameters, axis.margins.sensitivity_peak, reason))
+        peak = axis.margins.sensitivity_peak
+        axes.append(AxisTuning(side.axis, parameters, peak, reason, task.model.axes[k].kind))
         notes += drive_notes(side, axis, {} if k in kept else parameters)
         if now and present and present.stable and k not in kept:
             notes += given_up(side, axis, present.axes[k], (servo, now[k]), response)

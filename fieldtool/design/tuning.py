@@ -6,6 +6,7 @@ from math import sqrt
 
 import numpy as np
 
+from drives.units import Kind
 from fieldtool.design.drive_side import FILTERS, GAINS, DriveSide
 from fieldtool.design.moves import TestMove
 from fieldtool.design.predict import Prediction
@@ -56,6 +57,8 @@ class AxisTuning:
     """Of this axis' loop with all others closed, by the model."""
     reason: str
     """One sentence: how the numbers came about."""
+    kind: Kind = "rotary"
+    """Of the axis, on which units depend."""
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,7 @@ class _Axis(StrictModel):
     parameters: dict[str, Number]
     sensitivity_peak: Number = Field(gt=0)
     reason: str
+    kind: Literal["rotary", "linear"] = "rotary"
 
 
 class _Move(StrictModel):
@@ -96,6 +97,7 @@ def tuning_as_dict(tuning: Tuning) -> dict[str, Any]:
                 "parameters": dict(axis.parameters),
                 "sensitivity_peak": axis.sensitivity_peak,
                 "reason": axis.reason,
+                "kind": axis.kind,
             }
             for axis in tuning.axes
         ],

@@ -1,8 +1,12 @@
 """Design new parameters from a session folder: model and drives in, ``tuning.yaml`` out."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
+from drives.errors import ProfileError
+from drives.parameters import load_journal
+from drives.parameters.journal import State
 from drives.profile import MachineProfile, load_machine
 from fieldtool.design.decide import design
 from fieldtool.design.tuning import BOUND, Tuning
@@ -18,6 +22,10 @@ from fieldtool.workflow.models import model_of
 
 NOT_KNOWN = 0.3
 """Relative standard error of a mass or spring from which no controller is designed."""
+SINCE = (
+    "Before, and present parameters, are those of parameters-before.yaml: what the drives held before "
+    "the first write of this session. They were written since, and what they hold now is not compared."
+)
 Advance = Callable[[str, float], None]
 
 
@@ -79,8 +87,19 @@ def designed(
         top=_top(folder),
         advance=advance,
     )
+    if tuning.present is not None and _wrote(folder):
+        tuning = replace(tuning, notes=(SINCE, *tuning.notes))
     write_yaml(folder.tuning, tuning_as_dict(tuning))
     return tuning
+
+
+def _wrote(folder: SessionFolder) -> bool:
+    """Whether the drives were written from this session, and not all of it was taken back."""
+    try:
+        journal = load_journal(folder.journal)
+    except (ProfileError, OSError):
+        return False
+    return journal.writes and journal.state is not State.OLD
 
 
 def machine_kinds(model: MachineModel) -> dict[str, str]:

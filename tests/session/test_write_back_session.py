@@ -26,6 +26,7 @@ from drives.sim.faults import (
     WriteAltered,
 )
 from drives.sim.wire import unchanged
+from tests.tunings import begun
 from tests.untried import Stood
 
 pytestmark = pytest.mark.usefixtures("untried")
@@ -542,6 +543,24 @@ def test_the_report_knows_of_a_restore_from_a_file_of_the_session(session, name,
     assert session.command("report", session.out).code == 0
     text = re.sub(r"<[^>]*>|\s+", " ", (session.out / "report.html").read_text(encoding="utf-8"))
     assert said in text
+
+
+def test_a_design_after_a_write_says_of_when_its_present_parameters_are(bench):
+    def since():
+        outcome = bench.command("design", bench.out, "--response", "soft", "--json")
+        assert outcome.code == 0, outcome.err
+        found = json.loads(outcome.out)
+        assert found["present"] is not None
+        said = [note for note in found["notes"] if note.startswith("Before, and present")]
+        return len(said)
+
+    begun(bench)
+    assert write(bench).code == 0
+    assert since() == 1
+    assert bench.command("restore", bench.out).code == 0
+    assert since() == 0
+    assert write(bench).code == 0
+    assert since() == 1
 
 
 def test_a_restore_from_a_file_elsewhere_leaves_no_log_there(session):

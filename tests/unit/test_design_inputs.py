@@ -1,5 +1,6 @@
 """What a design is told of drives: from a backup as from the drive itself; what is said where not."""
 
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from importlib.resources import files
@@ -109,7 +110,11 @@ def test_the_command_says_what_is_there_and_what_will_be(
 ) -> None:
     folder = session(tmp_path, ("reference", "reference"))
     main_code(["design", str(folder.path), "--response", "soft", "--json"])
-    data = yaml.safe_load(capsys.readouterr().out)
+    told = capsys.readouterr()
+    shown = " ".join(told.err.split())
+    for name, unit in (("position_p", "1/s"), ("velocity_p", "N m s/rad"), ("inertia_ff", "kg m2")):
+        assert re.search(rf"{name} [0-9.e+-]+ {unit} ", shown), name
+    data = yaml.safe_load(told.out)
     assert data["response"] == "soft"
     assert data["bound"] == pytest.approx(1.4)
     for axis in data["prediction"]["axes"]:

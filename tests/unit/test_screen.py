@@ -9,12 +9,16 @@ from typing import Any
 import pytest
 from rich.console import Console
 
+from fieldtool.cli.design import show_tuning
 from fieldtool.cli.screen import TerminalScreen, model_table, parameter_rows, show_result
+from fieldtool.design.decide import design
 from fieldtool.design.tuning import AxisTuning, Tuning
+from fieldtool.design.tuning_file import read_tuning, tuning_as_dict
 from fieldtool.experiment.forecast import AxisForecast
 from fieldtool.experiment.stepped.plan import Sweep, SweepPlan, tone_near
 from fieldtool.experiment.stepped.runner import Progress
 from fieldtool.records.model import AxisModel, Coupling, Estimate, MachineModel
+from fieldtool.records.yaml_file import write_yaml
 from fieldtool.workflow import SessionResult
 from fieldtool.writeback.transaction import WriteBack
 
@@ -48,6 +52,32 @@ def shown(table: object, width: int = 120) -> str:
     out = console(width)
     out.print(table)
     return text(out)
+
+
+def test_what_a_design_predicts_has_the_units_of_each_kind_of_axis(tmp_path: Path) -> None:
+    machine = MachineModel(
+        (
+            AxisModel("table", "rotary", (Estimate(0.05),), (), ()),
+            AxisModel("slide", "linear", (Estimate(12.0),), (), ()),
+        )
+    )
+    out = console(200)
+    write_yaml(tmp_path / "tuning.yaml", tuning_as_dict(design(machine, response="soft")))
+    show_tuning(out, read_tuning(tmp_path / "tuning.yaml"))
+    rotary, linear = text(out).split("predicted")[1:]
+    assert "table" in rotary.partition("\n")[0]
+    assert "slide" in linear.partition("\n")[0]
+    for figure, units in (
+        ("bandwidth", ("Hz", "Hz")),
+        ("move: following error", ("rad", "m")),
+        ("move: settling", ("s", "s")),
+        ("last mass: vibration", ("rad", "m")),
+        ("move: torque", ("N m", "N")),
+        ("compliance", ("rad/(N m)", "m/N")),
+        ("noise of torque", ("N m", "N")),
+    ):
+        for table, unit in zip((rotary, linear), units, strict=True):
+            assert f"  {figure}, {unit}  " in table
 
 
 def test_the_model_with_units_intervals_and_truth() -> None:
