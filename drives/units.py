@@ -185,6 +185,9 @@ _ON_LINEAR_AXES = {
     "kg m2": "kg",
     "rad": "m",
     "rad/s": "m/s",
+    "rad/s2": "m/s2",
+    "rad/s3": "m/s3",
+    "N m/A": "N/A",
     "rad/(N m)": "m/N",
 }
 

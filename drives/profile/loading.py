@@ -10,7 +10,7 @@ from pydantic import ValidationError
 from drives.errors import ProfileError
 from drives.profile.drive import DriveProfile
 from drives.profile.machine import MachineProfile
-from drives.profile.plain_words import place_words, problem_words
+from drives.profile.plain_words import place_words, problem_words, unit_of
 from drives.profile.values import LocatedError
 from drives.profile.yaml_reader import Lines, Location, line_of, read_yaml
 
@@ -108,14 +108,16 @@ def _load(path: Path, model: type[P]) -> P:
     try:
         profile = model.model_validate(data)
     except ValidationError as error:
-        location, message, first = _first_of(error, lines)
+        location, message, first = _first_of(error, lines, data)
         raise ProfileError(
             path, _sentence(location, message, first, data), line_of(lines, location)
         ) from None
     return profile.model_copy(update={"path": path})
 
 
-def _first_of(error: ValidationError, lines: Lines) -> tuple[Location, str, Mapping[str, Any]]:
+def _first_of(
+    error: ValidationError, lines: Lines, data: Any
+) -> tuple[Location, str, Mapping[str, Any]]:
     """Return place, message and details of the error to tell.
 
     A misspelled key also shows as a missing one: its spelling is named.  A value of several forms,
@@ -124,7 +126,7 @@ def _first_of(error: ValidationError, lines: Lines) -> tuple[Location, str, Mapp
     errors = error.errors()
     first = next((e for e in errors if e["type"] == "extra_forbidden"), errors[0])
     location = _in_file(first["loc"], lines, missing=first["type"] == "missing")
-    message = problem_words(first)
+    message = problem_words(first, unit_of(location, data))
     inner = first.get("ctx", {}).get("error")
     if isinstance(inner, LocatedError):
         location += inner.location

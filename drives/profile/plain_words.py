@@ -4,6 +4,8 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from drives.units import unit_on
+
 UNBUILT = (ValueError, TypeError, LookupError, AttributeError)
 """What the YAML library raises where a value is not of the type that stands before it: ``!!int x``."""
 Place = tuple[str | int, ...]
@@ -48,6 +50,52 @@ LONGEST_NUMBER = 1000
 """Bits of a whole number that is shown; Python refuses to write very long ones out."""
 LONGEST_TEXT = 60
 """Characters of a text that is shown."""
+
+
+_WITH_UNIT = re.compile(r"\s*[-+]?\d[\d.]*(e[-+]?\d+)?\s*[^\s\d.,].*", re.IGNORECASE)
+_BARE: Mapping[str, str] = {
+    "bitrate": "bit/s",
+    "feed": "m per encoder revolution",
+    "torque_constant": "N m/A",
+    "motor_inertia.value": "kg m2",
+    "masses": "kg m2",
+    "springs": "N m/rad",
+    "dampers": "N m s/rad",
+    "viscous_friction": "N m s/rad",
+    "rated_torque": "N m",
+    "peak_torque": "N m",
+    "torque_noise": "N m",
+    "typical_move.distance": "rad",
+    "typical_move.velocity": "rad/s",
+    "typical_move.acceleration": "rad/s2",
+    "typical_move.jerk": "rad/s3",
+    "typical_move.band": "rad",
+    "loop.position_p": "1/s",
+    "loop.velocity_p": "N m s/rad",
+    "loop.velocity_i": "N m/rad",
+    "loop.inertia_ff": "kg m2",
+}
+"""Units on rotary axes of bare numbers in machine profiles, by the last keys of their place."""
+
+
+def unit_of(place: Place, data: Any) -> str:
+    """Return the unit of a bare number in a machine profile; empty where none is known.
+
+    Parameters
+    ----------
+    place
+        Keys and list positions.
+    data
+        The file's plain values, for the kinds of axes.
+    """
+    names = [part for part in place if isinstance(part, str)]
+    unit = _BARE.get(".".join(names[-2:])) or _BARE.get("".join(names[-1:]), "")
+    number = next((part for part in place if isinstance(part, int)), None)
+    axes = data.get("axes") if isinstance(data, Mapping) else None
+    if number is None or not isinstance(axes, list) or number >= len(axes):
+        return unit
+    linear = isinstance(axes[number], Mapping) and axes[number].get("kind") == "linear"
+    return unit_on("linear", unit) if linear else unit
 
 
 def syntax_words(problem: str | None) -> str:
@@ -116,8 +164,11 @@ def _name_of(items: Any, number: int, data: Any, above: Place) -> str:
     return ""
 
 
-def problem_words(error: Mapping[str, Any]) -> str:
-    """Return what is wrong with a value, of one of pydantic's errors, with what was given."""
+def problem_words(error: Mapping[str, Any], unit: str = "") -> str:
+    """Return what is wrong with a value, of one of pydantic's errors, with what was given.
+
+    ``unit``: in which a number is meant that stands without one.
+    """
     kind, given = str(error["type"]), error.get("input")
     limits: Mapping[str, Any] = error.get("ctx") or {}
     shown = f", not {_shown(given)}" if isinstance(given, str | int | float | bool) else ""
@@ -126,10 +177,11 @@ def problem_words(error: Mapping[str, Any]) -> str:
     if kind in ("tuple_type", "list_type"):
         example = f", such as [{given}]" if type(given) is int and abs(given) < 10**9 else ""
         return f"a list in brackets belongs here{example}"
-    if kind.startswith("float"):
-        return f"a number belongs here{shown}"
-    if kind.startswith("int"):
-        return f"a whole number belongs here{shown}"
+    if kind.startswith(("float", "int")):
+        whole = "" if kind.startswith("float") else "whole "
+        alone = isinstance(given, str) and _WITH_UNIT.fullmatch(given)
+        without = " without a unit" if alone else ""
+        return f"a {whole}number{without} belongs here{f', in {unit}' if unit else ''}{shown}"
     if kind.startswith("bool"):
         return f"true or false belongs here{shown}"
     if kind == "string_type":

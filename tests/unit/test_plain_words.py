@@ -5,7 +5,7 @@ import pytest
 from drives.canopen_drive.group import profile_of
 from drives.errors import ProfileError
 from drives.profile import load_machine
-from drives.profile.plain_words import place_words
+from drives.profile.plain_words import place_words, unit_of
 
 GOOD = (
     "format: fieldtool-machine/1\nname: m\nbus: {interface: fieldsim, channel: x}\naxes:\n"
@@ -48,6 +48,11 @@ PROGRAMMERS = (
         ("node_id: 11", "node_id: 011", 7, "011 would be read to the base of 8"),
         ("[0.02, 0.025]", "[0.02, 1:30]", 16, "1:30 would be read to the base of 60"),
         ("[0.02, 0.025]", "[0.02, 1:30.5]", 16, "1:30.5 would be read to the base of 60"),
+        ("    limits:", "    feed: 500 mm\n    limits:", 9,
+         "feed: a number without a unit belongs here, in m per encoder revolution, not '500 mm'"),
+        ("springs: [190]", "springs: [190 N m/rad]", 17, "without a unit belongs here, in N m/rad, not"),
+        ("springs: [190]", "springs: [stiff]", 17, "a number belongs here, in N m/rad, not 'stiff'"),
+        ("bus: {", "bus: {bitrate: 500 kbit/s, ", 3, "number without a unit belongs here, in bit/s,"),
         ("name: table", "name: größe", 5, "axis größe, name: is a letter, then up to 31 letters"),
     ],
 )  # fmt: skip
@@ -62,6 +67,24 @@ def test_a_fault_is_said_in_plain_words_with_its_line(tmp_path, old, new, line, 
     assert said in text
     assert text.startswith(f"{path}:{line}: ")
     assert not [word for word in PROGRAMMERS if word in text.removeprefix(str(path))]
+
+
+def test_a_bare_number_of_a_linear_axis_is_said_in_its_units():
+    axes = [{"kind": "rotary"}, {"kind": "linear"}]
+    for *place, unit in (
+        ("axes", 1, "prior", "masses", 0, "kg"),
+        ("axes", 1, "typical_move", "acceleration", "m/s2"),
+        ("axes", 1, "torque_constant", "N/A"),
+        ("axes", 1, "loop", "velocity_p", "N s/m"),
+        ("axes", 0, "loop", "velocity_p", "N m s/rad"),
+        ("simulation", "axes", 1, "rated_torque", "N"),
+        ("axes", 1, "feed", "m per encoder revolution"),
+        ("axes", 1, "name", ""),
+        ("axes", 7, "loop", "velocity_p", "N m s/rad"),
+    ):
+        assert unit_of(tuple(place), {"axes": axes}) == unit
+    assert unit_of(("axes", 0, "feed"), {"axes": 3}) == "m per encoder revolution"
+    assert unit_of((), None) == ""
 
 
 def test_places_are_named_as_people_name_them():
