@@ -9,9 +9,9 @@ the masses.
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from drives.compiled import compiled
 from drives.sim.effects.shapes import ElementKind
 
 FloatArray = NDArray[np.float64]
@@ -54,7 +54,7 @@ class Shafts(NamedTuple):
     """Where the queues' newest entries are, shape (1,), changed."""
 
 
-@njit(cache=True)
+@compiled()
 def _bristles(p, memory, velocity, step):  # type: ignore[no-untyped-def]
     sliding = p[0] if velocity >= 0.0 else p[1]
     sliding *= 1.0 + (p[2] - 1.0) * np.exp(-((velocity / p[3]) ** 2))
@@ -67,7 +67,7 @@ def _bristles(p, memory, velocity, step):  # type: ignore[no-untyped-def]
     return p[4] * 0.5 * (before + after) + p[5] * (after - before) / step
 
 
-@njit(cache=True)
+@compiled()
 def _gap(p, memory, twist, velocity):  # type: ignore[no-untyped-def]
     """What the joint pulls, less what the matrices have already."""
     linear = p[1] * twist + p[2] * velocity
@@ -84,7 +84,7 @@ def _gap(p, memory, twist, velocity):  # type: ignore[no-untyped-def]
     return np.copysign(max(contact, 0.0), twist) - linear
 
 
-@njit(cache=True)
+@compiled()
 def _pulled(kind, p, memory, twist, velocity, time, step):  # type: ignore[no-untyped-def]
     """Force against the twist (or motion) of one element."""
     if kind == ElementKind.BRISTLES:
@@ -120,7 +120,7 @@ def _pulled(kind, p, memory, twist, velocity, time, step):  # type: ignore[no-un
     return -p[0] * x
 
 
-@njit(cache=True)
+@compiled()
 def element_forces(state, elements, time, step, forces):  # type: ignore[no-untyped-def]
     """Write the forces of all elements, shape (F,), for a state (q, q'), shape (2n,)."""
     size = state.size // 2
@@ -156,7 +156,7 @@ def element_forces(state, elements, time, step, forces):  # type: ignore[no-unty
             forces[elements.slots[e, 1]] -= pull
 
 
-@njit(cache=True)
+@compiled()
 def delivered(axis, torque, shafts):  # type: ignore[no-untyped-def]
     """Mean torque at the shaft over a step for the mean torque that the drive reports."""
     given = torque * shafts.scale[axis]
@@ -168,7 +168,7 @@ def delivered(axis, torque, shafts):  # type: ignore[no-untyped-def]
     return given + shafts.lag[axis, 1] * behind
 
 
-@njit(cache=True)
+@compiled()
 def seen(axis, position, shafts):  # type: ignore[no-untyped-def]
     """Position that the encoder shows of the shaft's."""
     rate = shafts.encoder[axis, 0]
@@ -180,13 +180,13 @@ def seen(axis, position, shafts):  # type: ignore[no-untyped-def]
     return position + np.arctan2(s * cosine - c * sine, c * cosine + s * sine) / rate
 
 
-@njit(cache=True)
+@compiled()
 def queue_counts(axis, counts, shafts):  # type: ignore[no-untyped-def]
     """Put an axis' counts into its queue, at the newest place."""
     shafts.queue[axis, shafts.places[0]] = counts
 
 
-@njit(cache=True)
+@compiled()
 def late_counts(shafts, counts):  # type: ignore[no-untyped-def]
     """Overwrite counts, shape (M,), by what has come out of the queues."""
     length = shafts.queue.shape[1]

@@ -29,8 +29,9 @@ from enum import IntEnum
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from drives.compiled import compiled
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -260,13 +261,13 @@ LARGEST_COUNT = 2.0**53
 VANISHED = 1e-150
 
 
-@njit(cache=True)
+@compiled()
 def _settled(value):  # type: ignore[no-untyped-def]
     """A decay that has become immeasurably small ends at 0; denormal numbers are slow."""
     return value if abs(value) > VANISHED else 0.0
 
 
-@njit(cache=True)
+@compiled()
 def _filtered(signals, settings, state, first, x):  # type: ignore[no-untyped-def]
     """One biquad, direct form I: its memory holds signals, so new coefficients make no jump."""
     y = (
@@ -283,7 +284,7 @@ def _filtered(signals, settings, state, first, x):  # type: ignore[no-untyped-de
     return signals[state + 2]
 
 
-@njit(cache=True)
+@compiled()
 def _ramp_velocity(signals, step):  # type: ignore[no-untyped-def]
     """Move the velocity reference one step towards its target; slow down first, then speed up."""
     velocity, target = signals[Signal.VELOCITY_REFERENCE], signals[Signal.TARGET]
@@ -304,7 +305,7 @@ def _ramp_velocity(signals, step):  # type: ignore[no-untyped-def]
         signals[Signal.ACCELERATION_REFERENCE] = difference / step if ramped else 0.0
 
 
-@njit(cache=True)
+@compiled()
 def _ramp_torque(signals, settings, step):  # type: ignore[no-untyped-def]
     torque, target = signals[Signal.TORQUE_REFERENCE], signals[Signal.TARGET]
     change = settings[Parameter.TORQUE_SLOPE] * step
@@ -315,7 +316,7 @@ def _ramp_torque(signals, settings, step):  # type: ignore[no-untyped-def]
     signals[Signal.TORQUE_REFERENCE] = torque
 
 
-@njit(cache=True)
+@compiled()
 def _velocity_error(signals, settings, mode, step):  # type: ignore[no-untyped-def]
     """Position loop, and what else makes the velocity reference."""
     if mode == Reference.VELOCITY:
@@ -336,7 +337,7 @@ def _velocity_error(signals, settings, mode, step):  # type: ignore[no-untyped-d
     return command - signals[Signal.VELOCITY]
 
 
-@njit(cache=True)
+@compiled()
 def _control(signals, settings, step):  # type: ignore[no-untyped-def]
     """All loops of one axis; returns the mean torque of this inner step."""
     mode = int(signals[Signal.REFERENCE])
@@ -373,7 +374,7 @@ def _control(signals, settings, step):  # type: ignore[no-untyped-def]
     return given + settings[Derived.CURRENT_MEAN] * lag
 
 
-@njit(cache=True)
+@compiled()
 def _move_reference(signals, step):  # type: ignore[no-untyped-def]
     """Position reference at the end of the inner step."""
     mode = int(signals[Signal.REFERENCE])
@@ -393,7 +394,7 @@ def _move_reference(signals, step):  # type: ignore[no-untyped-def]
             signals[Signal.VELOCITY_REFERENCE] = signals[Signal.VELOCITY]
 
 
-@njit(cache=True)
+@compiled()
 def _place_on_profile(signals, time):  # type: ignore[no-untyped-def]
     """Reference, its velocity and its acceleration at a time since the profile began."""
     if time >= signals[Signal.PROFILE_DURATION]:
@@ -415,7 +416,7 @@ def _place_on_profile(signals, time):  # type: ignore[no-untyped-def]
     signals[Signal.ACCELERATION_REFERENCE] = acceleration
 
 
-@njit(cache=True)
+@compiled()
 def _sample(signals, settings, position, step):  # type: ignore[no-untyped-def]
     """Encoder, velocity estimate, reference and what is watched, at the end of the inner step."""
     counts = np.floor(position * settings[Derived.COUNTS_PER_UNIT])
@@ -440,14 +441,14 @@ def _sample(signals, settings, position, step):  # type: ignore[no-untyped-def]
         signals[Signal.ERROR_STEPS] = 0.0
 
 
-@njit(cache=True)
+@compiled()
 def _hold_motor(state, motor, position):  # type: ignore[no-untyped-def]
     """Leave a motor where it was, at rest: what holds it is stronger than anything else."""
     state[motor] = position
     state[state.size // 2 + motor] = 0.0
 
 
-@njit(cache=True)
+@compiled()
 def advance(steps, step, state, signals, settings, increments, motors):  # type: ignore[no-untyped-def]
     """Step plant and drives; True if every number is still good.
 
@@ -486,7 +487,7 @@ def advance(steps, step, state, signals, settings, increments, motors):  # type:
     return _countable(state, settings, motors)
 
 
-@njit(cache=True)
+@compiled()
 def _countable(state, settings, motors):  # type: ignore[no-untyped-def]
     """Every number is finite and within what the encoders can count."""
     good = True
@@ -498,7 +499,7 @@ def _countable(state, settings, motors):  # type: ignore[no-untyped-def]
     return good
 
 
-@njit(cache=True)
+@compiled()
 def advance_holding(steps, step, state, signals, settings, motors, holding):  # type: ignore[no-untyped-def]
     """Step plant and drives as :func:`advance`, with friction; returns an ``Outcome``.
 
@@ -540,7 +541,7 @@ def advance_holding(steps, step, state, signals, settings, motors, holding):  # 
     return Outcome.DIVERGED
 
 
-@njit(cache=True)
+@compiled()
 def _move_holding(state, axes, holding, change):  # type: ignore[no-untyped-def]
     """Move the plant to the end of the inner step, piece by piece; False if a set is missing."""
     order, progress, inputs = state.size, holding.progress, holding.inputs
@@ -569,7 +570,7 @@ def _move_holding(state, axes, holding, change):  # type: ignore[no-untyped-def]
     return True
 
 
-@njit(cache=True)
+@compiled()
 def _try_piece(state, holding, found, change):  # type: ignore[no-untyped-def]
     """Take a piece of the step if nothing happens in it, else look closer or note the event."""
     order, progress, inputs = state.size, holding.progress, holding.inputs
@@ -609,7 +610,7 @@ def _try_piece(state, holding, found, change):  # type: ignore[no-untyped-def]
         progress[Progress.PENDING] = Pending.CHECK
 
 
-@njit(cache=True)
+@compiled()
 def _find_set(holding):  # type: ignore[no-untyped-def]
     """Row of the tables for the masses that stand now, or -1."""
     for row in range(holding.standing.shape[0]):
@@ -621,7 +622,7 @@ def _find_set(holding):  # type: ignore[no-untyped-def]
     return -1
 
 
-@njit(cache=True)
+@compiled()
 def _take_velocity(state, holding, found):  # type: ignore[no-untyped-def]
     """Bring standing masses to velocity 0 by a push on them alone: the others' momentum stays."""
     size = state.size // 2
@@ -634,7 +635,7 @@ def _take_velocity(state, holding, found):  # type: ignore[no-untyped-def]
             state[size + mass] = 0.0
 
 
-@njit(cache=True)
+@compiled()
 def _turns_back(state, holding, change, last):  # type: ignore[no-untyped-def]
     """A sliding mass would go against its direction in this piece; if it is the last, note which.
 
@@ -660,7 +661,7 @@ def _turns_back(state, holding, change, last):  # type: ignore[no-untyped-def]
     return found
 
 
-@njit(cache=True)
+@compiled()
 def _holds(holding, found):  # type: ignore[no-untyped-def]
     """Friction can keep every standing mass where it is, with the state that inputs hold."""
     for k in range(holding.masses.size):
@@ -673,7 +674,7 @@ def _holds(holding, found):  # type: ignore[no-untyped-def]
     return True
 
 
-@njit(cache=True)
+@compiled()
 def _break_away(holding):  # type: ignore[no-untyped-def]
     """Let go what friction can not hold; True if that is any mass.
 
@@ -705,7 +706,7 @@ def _break_away(holding):  # type: ignore[no-untyped-def]
     return freed
 
 
-@njit(cache=True)
+@compiled()
 def follow_position(signals, settings, target, steps, step):  # type: ignore[no-untyped-def]
     """Begin a new interpolation interval of one axis; it has ``steps`` inner steps."""
     target = min(max(target, settings[Parameter.POSITION_MIN]), settings[Parameter.POSITION_MAX])
@@ -723,7 +724,7 @@ def follow_position(signals, settings, target, steps, step):  # type: ignore[no-
     signals[Signal.ACCELERATION_REFERENCE] = change / (steps * step)
 
 
-@njit(cache=True)
+@compiled()
 def begin_profile(signals, duration, target, segments):  # type: ignore[no-untyped-def]
     """Take over a planned profile: ``segments``, shape (4, 4), as columns from PROFILE have them."""
     signals[Signal.REFERENCE] = float(PROFILE_MODE)
@@ -736,7 +737,7 @@ def begin_profile(signals, duration, target, segments):  # type: ignore[no-untyp
     _place_on_profile(signals, 0.0)
 
 
-@njit(cache=True)
+@compiled()
 def latch(signals, settings, noise, counts, torque, velocity):  # type: ignore[no-untyped-def]
     """Write counts, torque in 1/1000 of rated torque and velocity of all axes, each shape (M,).
 

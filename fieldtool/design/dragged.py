@@ -15,9 +15,9 @@ Seidel, projected); the problem is convex.
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from scipy.linalg import expm
 
+from drives.compiled import compiled
 from fieldtool.design.loops import ComplexArray, state_space
 from fieldtool.design.machine import Machine, Response
 from fieldtool.design.servo import Servo
@@ -102,7 +102,7 @@ def dragged(
     return Dragged(out[:, 0], out[:, 1], out[:, 2])
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled()
 def _march(
     ahead: FloatArray,
     pushed: FloatArray,

@@ -7,8 +7,9 @@ too (exponential Runge-Kutta method of second order, Cox and Matthews, J. Comput
 """
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from drives.compiled import compiled
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -17,7 +18,7 @@ CUBIC, GAP, STEP, DRY, SOFT = 1, 2, 3, 4, 5
 """As :class:`fieldtool.criticise.simulate.structure.Law`."""
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled()
 def plus_row(total: float, matrix: FloatArray, row: int, vector: FloatArray) -> float:
     """Return total plus one row of a matrix times a vector, added up in order."""
     for j in range(vector.size):
@@ -25,7 +26,7 @@ def plus_row(total: float, matrix: FloatArray, row: int, vector: FloatArray) -> 
     return total
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled()
 def march(step: FloatArray, pushes: FloatArray, start: FloatArray) -> FloatArray:
     """Return the states (n, S) of z[k+1] = step z[k] + pushes[k] from z[0] = start."""
     n, size = pushes.shape[0] + 1, start.size
@@ -37,7 +38,7 @@ def march(step: FloatArray, pushes: FloatArray, start: FloatArray) -> FloatArray
     return z
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled()
 def ring(step: FloatArray, starts: FloatArray, rows: int) -> FloatArray:
     """Return the states (F, rows, S) that nothing pushes, from each initial one (F, S)."""
     count, size = starts.shape
@@ -50,7 +51,7 @@ def ring(step: FloatArray, starts: FloatArray, rows: int) -> FloatArray:
     return z
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled()
 def both_ways(sections: FloatArray, at_rest: FloatArray, values: FloatArray) -> FloatArray:
     """Filter the columns of (n, M) forward and backward; no phase is left, (n, M).
 
@@ -88,7 +89,7 @@ def both_ways(sections: FloatArray, at_rest: FloatArray, values: FloatArray) -> 
     return out[more : more + n]
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled(error_model="numpy")
 def pull(
     law: int, values: FloatArray, s: float, rate: float, t: float, span: float, elapsed: float
 ) -> float:
@@ -113,7 +114,7 @@ def pull(
     return p0 * float(np.tanh(rate / p1))
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled(error_model="numpy")
 def stretch(
     ends: IntArray,
     place: IntArray,
@@ -142,7 +143,7 @@ def stretch(
     return s, rate
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled(error_model="numpy")
 def march_bent(
     step: FloatArray,
     of_start: FloatArray,
@@ -224,7 +225,7 @@ def march_bent(
     return states, pushed
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled()
 def slider(
     position: FloatArray, forward: FloatArray, backward: FloatArray, reach: float
 ) -> FloatArray:
