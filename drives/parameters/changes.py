@@ -151,7 +151,8 @@ def changes_back_to(drive: CanopenDrive, held: Mapping[ObjectAddress, Raw]) -> t
     Raises
     ------
     NotSupportedError
-        If one that would change may not be written, or is outside its range.
+        If one that would change may not be written, has another unit in this drive now, or is outside
+        its range.
     """
     conversion = drive.conversion()
     changes = []
@@ -179,6 +180,10 @@ def changes_back_to(drive: CanopenDrive, held: Mapping[ObjectAddress, Raw]) -> t
                     raise NotSupportedError(
                         f"{drive.axis}: {why} Enter {name} with the maker's software. "
                         "Nothing was written."
+                    )
+                if name in conversion.unmet:  # the same number may be another gain now
+                    raise NotSupportedError(
+                        f"{drive.axis}, {name}: {conversion.unmet[name]} Nothing was written."
                     )
                 _check_write_known(drive, name, parameter)
                 if known:

@@ -39,7 +39,7 @@ def write_durably(
     finally:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
-    _sync_folder(path.parent)
+    sync_folder(path.parent)
 
 
 def remove_durably(path: Path) -> None:
@@ -51,10 +51,10 @@ def remove_durably(path: Path) -> None:
         If it can not be removed.
     """
     path.unlink(missing_ok=True)
-    _sync_folder(path.parent)
+    sync_folder(path.parent)
 
 
-def _sync_folder(folder: Path) -> None:
+def sync_folder(folder: Path) -> None:
     """Bring a folder's entries to the disk; Windows does so by itself and lets nobody ask."""
     with suppress(OSError):
         handle = os.open(folder, os.O_RDONLY)

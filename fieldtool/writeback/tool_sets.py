@@ -29,6 +29,7 @@ from drives.parameters import (
     load_journal,
     save_backup,
 )
+from drives.parameters.durable import sync_folder
 from drives.parameters.journal import State
 from fieldtool.errors import NoSuchToolError, OutputError
 from fieldtool.records.session_folder import SessionFolder
@@ -243,6 +244,7 @@ def _keep(
             write_tool_file(new["tool.yaml"], ToolFile(**tool.as_dict(), parameters=beside))
             for name_now, path in new.items():
                 path.replace(folder / name_now)
+            sync_folder(folder)
         finally:
             for path in new.values():
                 path.unlink(missing_ok=True)

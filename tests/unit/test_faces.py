@@ -17,7 +17,12 @@ from drives.objects import ObjectAddress, ObjectInfo, decode, encode
 from drives.parameters import DriveBackup, DriveRecord, HeldObject, JournalEntry, Phase
 from drives.parameters.access import take_over, unlock
 from drives.parameters.bring_back import bring_back
-from drives.parameters.changes import planned_changes, read_loop, read_parameters
+from drives.parameters.changes import (
+    changes_back_to,
+    planned_changes,
+    read_loop,
+    read_parameters,
+)
 from drives.profile import load_drive, load_machine
 from drives.sim.faces import Motor, face_names, face_of
 from drives.sim.faces.others import PASSWORD
@@ -159,6 +164,20 @@ def test_a_gain_whose_unit_was_changed_in_the_drive_is_not_understood(connected)
     assert "pid_i" not in read_parameters(drive)
     with pytest.raises(NotSupportedError, match="its unit is known only while object 0x30A1:09 is"):
         planned_changes(drive, dict.fromkeys(CASCADE, 1.0))
+
+
+def test_numbers_that_a_drive_held_in_another_unit_are_not_brought_back(connected):
+    drive, node, _ = connected("epos4")
+    drive.read_scaling()
+    address = drive.profile.parameters["pid_i"].object
+    held = {address: node.dictionary.read(0x30A1, 2)}
+    node.dictionary.write(0x30A1, 9, 0xFD040300)
+    assert not any(change.differs for change in changes_back_to(drive, held))  # nothing to write
+    held[address] += 1
+    with pytest.raises(
+        NotSupportedError, match=r"pid_i: its unit is known only.*Nothing was written"
+    ):
+        changes_back_to(drive, held)
 
 
 def test_what_has_no_known_unit_is_not_written(connected):
