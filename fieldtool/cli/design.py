@@ -41,7 +41,7 @@ ROWS: tuple[tuple[str, str, float, Figure], ...] = (
     ("move: overshoot", "rad", 1, _motor("overshoot")),
     ("move: settling", "s", 1, _motor("settling_time")),
     ("last mass: settling", "s", 1, _load("settling_time")),
-    ("last mass: vibration", "rad", 1, _load("residual_rms")),
+    ("last mass: vibration", "rad", 1, _load("residual_peak")),
     ("move: torque", "N m", 1, lambda one: one.peak_torque),
     ("step: settling", "s", 1, lambda one: None if one.step is None else one.step.settling_time),
     ("compliance", "rad/(N m)", 1, lambda one: one.compliance),

@@ -1,6 +1,7 @@
 """Figures of merit of a move, a step and a loop: the same for what is simulated and what is measured."""
 
 from dataclasses import asdict, dataclass
+from math import inf
 from typing import Any
 
 import numpy as np
@@ -11,9 +12,6 @@ from fieldtool.records.model import FloatArray
 ComplexArray = NDArray[np.complexfloating[Any, Any]]
 STEP_BAND = 0.02
 """Of a step's height: within it the step has settled."""
-SHORTEST_WATCH, LONGEST_WATCH = 0.5, 6.0
-"""s: a move's vibration is that of as much time after its reference as this took, within these bounds:
-records of any length, measured or predicted, compare."""
 STRAYS = 1.2
 """Times a following error, and half the band about the target: one above is clearly larger."""
 CREEPS = 24
@@ -37,7 +35,7 @@ class MoveFigures:
     following_error: float
     """Largest distance from the reference, from its beginning to the end of the record."""
     residual_peak: float
-    """Largest deviation of the oscillating part after the reference has ended; see :func:`watched`."""
+    """Largest deviation of the oscillating part after the reference has ended."""
     residual_rms: float
     """RMS of that part."""
     band: float
@@ -65,20 +63,28 @@ class StepFigures:
 
 
 def move_figures(
-    time: FloatArray, reference: FloatArray, position: FloatArray, band: float
+    time: FloatArray,
+    reference: FloatArray,
+    position: FloatArray,
+    band: float,
+    watched: float = inf,
 ) -> MoveFigures:
     """Return the figures of a move from rest to rest.
 
     Parameters
     ----------
     time
-        s, shape (n,), ascending; the record should go on after the reference has ended for several
-        periods of the slowest oscillation, and for what :func:`watched` returns.
+        s, shape (n,), ascending; the record should go on for several periods of the slowest
+        oscillation after the reference has ended.
     reference, position
         Of the same axis at these times, shape (n,), rad or m; a delay of the measurement that is
         known should be taken out first.
     band
         Half its width, rad or m, above 0.
+    watched
+        s, from the end of the reference, over which the oscillating part is looked at; all that was
+        recorded where it is less.  What is told from the oscillation as creep depends on it: records
+        of different length compare over the same time only.
 
     Raises
     ------
@@ -96,8 +102,7 @@ def move_figures(
     target, way = float(reference[-1]), float(reference[-1] - reference[0])
     beyond = (position - target) * np.sign(way if way else 1.0)
     arrived = last_outside(time, position - target, band)
-    seen = time <= time[end] + watched(float(time[end] - time[begin]))
-    seen[:end] = False
+    seen = slice(end, end + int(np.count_nonzero(time[end:] <= time[end] + watched)))
     swing = oscillation(time[seen], (position - target)[seen])
     return MoveFigures(
         settling_time=max(arrived - float(time[end]), 0.0),
@@ -108,11 +113,6 @@ def move_figures(
         residual_rms=float(np.sqrt(np.mean(swing**2))),
         band=band,
     )
-
-
-def watched(duration: float) -> float:
-    """Return how long after a move of this duration its vibration is looked at, s."""
-    return min(max(duration, SHORTEST_WATCH), LONGEST_WATCH)
 
 
 def strays(new: float, was: float, band: float) -> bool:

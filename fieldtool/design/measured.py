@@ -18,6 +18,7 @@ added, and where the loop leaves little of it, most of what is seen: it is taken
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from math import inf
 from typing import Any
 
 import numpy as np
@@ -136,7 +137,7 @@ def _phasors(values: FloatArray, signals: Excited) -> ComplexArray:
 
 
 def measured_move(
-    time: FloatArray, target: FloatArray, position: FloatArray, band: float
+    time: FloatArray, target: FloatArray, position: FloatArray, band: float, watched: float = inf
 ) -> tuple[MoveFigures, MoveFigures]:
     """Return the figures of a move out and of that back.
 
@@ -145,8 +146,8 @@ def measured_move(
     time, target, position
         Of the axis, shape (n,); the record begins at rest before the move out, holds still between
         the two, and ends at rest.  A target that is sent with one sample is reached at the next one.
-    band
-        As :func:`fieldtool.design.figures.move_figures` wants it.
+    band, watched
+        As :func:`fieldtool.design.figures.move_figures` wants them.
 
     Raises
     ------
@@ -162,8 +163,8 @@ def measured_move(
     out = slice(0, back + 1)
     home = slice(back, reference.size)
     return (
-        move_figures(time[out], reference[out], position[out], band),
-        move_figures(time[home] - time[back], reference[home], position[home], band),
+        move_figures(time[out], reference[out], position[out], band, watched),
+        move_figures(time[home] - time[back], reference[home], position[home], band, watched),
     )
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fieldtool.design.dragged import dragged, rubbing
-from fieldtool.design.figures import MoveFigures, StepFigures, move_figures, step_figures, watched
+from fieldtool.design.figures import MoveFigures, StepFigures, move_figures, step_figures
 from fieldtool.design.loops import Loops
 from fieldtool.design.machine import Machine, respond
 from fieldtool.design.moves import TestMove
@@ -36,6 +36,8 @@ class Curves:
     """Of the move, rad or m, from 0."""
     position: FloatArray
     """Motor."""
+    back: FloatArray
+    """Motor on the way back, told as if it were the way out: another one with dry friction alone."""
     load: FloatArray
     """Last mass."""
     torque: FloatArray
@@ -86,7 +88,7 @@ def moved(
     beyond = move.duration
     if machine.dry:
         beyond += min(_stuck(machine, servos, move), LONGEST_STUCK)
-    wave = _wave(eigenvalues, beyond, watched(move.duration), move.duration / 200)
+    wave = _wave(eigenvalues, beyond, move.duration / 200)
     drive = wave.spectrum(wave.move(move))
     loops = Loops(respond(machine, wave.omega), servos)
     s = 1j * wave.omega
@@ -101,7 +103,8 @@ def moved(
     if machine.dry:
         rubbed = rubbing(machine, loops.response, *phasors)
         ways = _dragged_ways(machine, servos, axis, wave, rubbed, ways[0])
-    curves = Curves(time, reference, ways[0][0], ways[0][1], ways[0][2], time, stepped)
+    (motor, last, torque), back = ways[0], ways[-1][0]
+    curves = Curves(time, reference, motor, back, last, torque, time, stepped)
     band = move.settling_band
     speeds = np.gradient(motors, time, axis=1)
     return Moved(
@@ -155,7 +158,7 @@ def _worst(figures: Sequence[MoveFigures]) -> MoveFigures:
     )
 
 
-def _wave(values: ComplexArray, beyond: float, seen: float, shortest: float) -> HalfWave:
+def _wave(values: ComplexArray, beyond: float, shortest: float) -> HalfWave:
     """Return samples for a response of a machine with these eigenvalues.
 
     Parameters
@@ -163,14 +166,11 @@ def _wave(values: ComplexArray, beyond: float, seen: float, shortest: float) -> 
     values
         Eigenvalues, rad/s.
     beyond
-        s, of the reference and of what else is to be waited for.
-    seen
-        s, at least, after that.
+        s, of the reference and of what else is to be seen.
     shortest
         s: no sample is longer.
     """
-    rests = min(DECAYS / max(-float(values.real.max()), 1e-6), LONGEST)
-    duration = beyond + max(rests, seen)
+    duration = beyond + min(DECAYS / max(-float(values.real.max()), 1e-6), LONGEST)
     matters = np.abs(values)[-values.real < 1e3 / duration + 20 / beyond]
     fastest = float(matters.max()) if matters.size else 1 / shortest
     step = min(shortest, 0.5 / fastest)

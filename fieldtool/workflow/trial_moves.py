@@ -7,7 +7,6 @@ import numpy as np
 
 from drives.api import AxisLimits
 from drives.canopen_drive import CanopenDrive
-from fieldtool.design.figures import LONGEST_WATCH, watched
 from fieldtool.design.moves import TestMove
 from fieldtool.design.predict import AxisPrediction, Prediction
 from fieldtool.errors import PlanRefusedError
@@ -28,8 +27,8 @@ SWELLS, BESIDE = 1.6, 0.15
 """Times the predicted torque, and share of the limit besides, that a move may take; never more than
 MOST of the limit, and OTHERS of it on axes that are not moved."""
 MOST, OTHERS = 0.97, 0.95
-REST = 2.0
-"""Times the predicted settling for which a move is watched after its end."""
+REST, LEAST_REST, MOST_REST = 2.0, 0.5, 6.0
+"""Times the predicted settling for which a move is watched after its end; at least, at most, s."""
 SHAKES = 1.5
 """Times the largest quick swing of its torque that is predicted that an axis may swing in its move."""
 UNFORESEEN, OFF_TARGET = 2.0, 0.05
@@ -166,9 +165,9 @@ def trial_move(
             for one in known
             if one.move is not None and np.isfinite(one.move.settling_time)
         ),
-        default=LONGEST_WATCH,
+        default=MOST_REST,
     )
-    rest = min(max(REST * settles, watched(move.duration)), LONGEST_WATCH)
+    rest = min(max(REST * settles, LEAST_REST, move.duration), MOST_REST)
     rise, held, _ = move.parts
     half = ACCELERATES * (2 * rise + held)
     swings, astray = _coming_to_rest(move, k, limits[k], predictions)

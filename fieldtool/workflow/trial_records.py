@@ -1,7 +1,8 @@
 """What the records of a trial come to: each axis before, as predicted, and after, on one scale."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from math import inf
 
 import numpy as np
 
@@ -17,7 +18,6 @@ from fieldtool.design.measured import (
     measured_move,
     measured_sensitivity,
 )
-from fieldtool.design.predict import Prediction
 from fieldtool.design.servo import Servo
 from fieldtool.design.verdict import Comparison
 from fieldtool.experiment.axes import Axes
@@ -84,9 +84,9 @@ class TrialRecords:
             move.distance,
             move.duration,
             move.settling_band,
-            _figures(old, k, move.axis, move.settling_band, old_curve),
-            _foreseen(plan.after, k, expected),
-            _figures(new, k, move.axis, move.settling_band, new_curve),
+            self._figures(old, k, old_curve),
+            self._foreseen(k, expected),
+            self._figures(new, k, new_curve),
             old_curve,
             expected,
             new_curve,
@@ -141,25 +141,42 @@ class TrialRecords:
             self.plan.new[k],
         )
 
+    def _watched(self, k: int) -> float:
+        """Return how long an axis is watched after its move, s."""
+        trial = self.plan.trial
+        return next(m.rest for m in trial.moves if m.axis == k) * trial.cycle_time
 
-def _figures(
-    tried: Tried | None, k: int, name: str, band: float, curve: Sensitivity | None
-) -> AxisFigures | None:
-    one = None if tried is None else tried.move(name)
-    if one is None or one.position_reference is None or not one.complete:
-        return None
-    moves = measured_move(one.time, one.position_reference[:, k], one.position[:, k], band)
-    torque = one.torque[:, k]
-    return axis_figures(moves, float(np.abs(torque - torque[0]).max()), curve)
+    def _figures(
+        self, tried: Tried | None, k: int, curve: Sensitivity | None
+    ) -> AxisFigures | None:
+        move = self.plan.moves[k]
+        one = None if tried is None else tried.move(move.axis)
+        if one is None or one.position_reference is None or not one.complete:
+            return None
+        moves = measured_move(
+            one.time,
+            one.position_reference[:, k],
+            one.position[:, k],
+            move.settling_band,
+            self._watched(k),
+        )
+        torque = one.torque[:, k]
+        return axis_figures(moves, float(np.abs(torque - torque[0]).max()), curve)
 
-
-def _foreseen(prediction: Prediction, k: int, curve: Sensitivity | None) -> AxisFigures | None:
-    axis = prediction.axes[k]
-    if axis.move is None:
-        return None
-    latest = axis.move.settling_time
-    if axis.curves is not None:
-        curves, band = axis.curves, INSIDE * axis.move.band
-        narrow = move_figures(curves.time, curves.reference, curves.position, band)
-        latest = max(latest, narrow.settling_time)
-    return axis_figures([axis.move], axis.peak_torque, curve, latest)
+    def _foreseen(self, k: int, curve: Sensitivity | None) -> AxisFigures | None:
+        axis = self.plan.after.axes[k]
+        if axis.move is None:
+            return None
+        if axis.curves is None:
+            return axis_figures([axis.move], axis.peak_torque, curve, axis.move.settling_time)
+        curves, band = axis.curves, axis.move.band
+        ways = (curves.position, curves.back)
+        # narrower, it tells what touches the edge; cut short, what swings in the time that is watched
+        narrow, short = (
+            [move_figures(curves.time, curves.reference, way, width, seen) for way in ways]
+            for width, seen in ((INSIDE * band, inf), (band, self._watched(k)))
+        )
+        latest = max(axis.move.settling_time, *(one.settling_time for one in narrow))
+        vibration = max(one.residual_peak for one in short)
+        moved = replace(axis.move, residual_peak=vibration)
+        return axis_figures([moved], axis.peak_torque, curve, latest)

@@ -136,7 +136,7 @@ def peers(rng: np.random.Generator, machines: int) -> None:
                 continue
             for k, (motor, load) in enumerate(moved(machine, servos, one.moves, shaped)):
                 settled = max(motor.settling_time, load.settling_time)
-                found[name].append((settled, height[k], load.residual_rms / one.moves[k].distance))
+                found[name].append((settled, height[k], load.residual_peak / one.moves[k].distance))
     print(
         f"\nPeers on {machines} machines with new tooling (median and 90 % of all axes, true machine)"
     )

@@ -131,7 +131,7 @@ def moved(
             figures = move_figures(wave.time, reference, position, band)
             # what swings once the shaped reference has ended, too
             swing = move_figures(wave.time, ended, position, band)
-            pair.append(replace(figures, residual_rms=swing.residual_rms))
+            pair.append(replace(figures, residual_peak=swing.residual_peak))
         out.append((pair[0], pair[1]))
     return out
 
