@@ -9,7 +9,9 @@ and where a position reference excites it, with P = q_k / T_k, the axis with all
     S_k = 1 / (1 + C_k P)                     C_k the drive's controller, as its parameters say
 
 Both are 1 / (1 + L_k) of the axis' loop with the others closed, the kk element of the sensitivity of all
-loops together.  An offset is held from cycle to cycle: its spectrum is that of the samples times
+loops together; 1 - S_k is the loop's response, how much of its reference it follows.
+
+An offset is held from cycle to cycle: its spectrum is that of the samples times
 ``exp(-s T / 2) sinc(w T / 2)``.  Torques are sampled at the cycles too, so the steps of the offset fold
 back; the machine does not answer to them.  At 40 Hz and 1 ms that is a tenth of the torque that was
 added, and where the loop leaves little of it, most of what is seen: it is taken off
@@ -41,6 +43,8 @@ class Sensitivity:
     """Hz, rising, shape (L,)."""
     size: FloatArray
     """abs(1 / (1 + L)), shape (L,)."""
+    response: FloatArray | None = None
+    """abs(L / (1 + L)), how much of its reference the loop follows, shape (L,); None: not known."""
 
     @property
     def peak(self) -> float:
@@ -73,7 +77,22 @@ class Sensitivity:
             "peak_frequency": self.peak_frequency,
             "frequency": [float(f) for f in self.frequency],
             "size": [float(v) for v in self.size],
+            "response": None if self.response is None else [float(v) for v in self.response],
         }
+
+    @classmethod
+    def of(cls, frequency: FloatArray, value: ComplexArray) -> "Sensitivity":
+        """Return that of complex values, in the order of frequencies.
+
+        Parameters
+        ----------
+        frequency
+            Hz, shape (L,).
+        value
+            1 / (1 + L), shape (L,).
+        """
+        order = np.argsort(frequency)
+        return cls(frequency[order], np.abs(value)[order], np.abs(1 - value)[order])
 
 
 @dataclass(frozen=True)
@@ -113,12 +132,12 @@ def measured_sensitivity(signals: Excited, servo: Servo) -> Sensitivity:
         if signals.lag is not None:
             torque = torque + _folded(offset, frequency, signals.step, signals.lag, servo)
         held = offset * np.sinc(frequency * signals.step)
-        size = np.abs(torque / (held * servo.loop.filtered(s)))
+        held *= np.exp(-s * (signals.step / 2 + (signals.lag or 0.0)))
+        value = torque / (held * servo.loop.filtered(s))
     else:
         plant = _phasors(signals.position, signals) / torque
-        size = np.abs(1 / (1 + servo.gain(s) * plant))
-    order = np.argsort(frequency)
-    return Sensitivity(frequency[order], size[order])
+        value = 1 / (1 + servo.gain(s) * plant)
+    return Sensitivity.of(frequency, value)
 
 
 def _folded(

@@ -10,8 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from fieldtool.design.figures import strays
+from fieldtool.design.figures import StepFigures, strays
 from fieldtool.design.measured import AxisFigures, Sensitivity
+from fieldtool.design.predict import finite
+from fieldtool.records.model import FloatArray
 
 MARGIN = 1.05
 """Times the bound that a measured peak of sensitivity may have: what its measurement is good for."""
@@ -39,6 +41,34 @@ TIME_OFF, MOVE_OFF = 0.3, 0.05
 """Shares of the predicted settling time, and of the move's own time, by which settling may be off."""
 
 
+STEP_POINTS, SETTLED = 200, 1.6
+"""Of a step that is kept as numbers; and times its settling time until which it is kept."""
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """How the motor follows a step of its reference, by the model, without feed-forward."""
+
+    figures: StepFigures
+    time: FloatArray
+    """s, shape (n,)."""
+    position: FloatArray
+    """Over the step's height, shape (n,)."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """Figures (infinite: null), and the course at STEP_POINTS times until it has settled."""
+        settled = self.figures.settling_time
+        seen = SETTLED * settled if isfinite(settled) else float(self.time[-1])
+        time = np.linspace(0.0, min(max(seen, float(self.time[1])), self.time[-1]), STEP_POINTS)
+        position = np.interp(time, self.time, self.position)
+        figures: dict[str, Any] = finite(self.figures.as_dict())
+        return {
+            **figures,
+            "time": [float(f"{t:.6g}") for t in time],
+            "position": [float(f"{p:.6g}") for p in position],
+        }
+
+
 @dataclass(frozen=True, eq=False)
 class Comparison:
     """One axis before, as predicted, and after; all on one scale."""
@@ -61,6 +91,10 @@ class Comparison:
     sensitivity_predicted: Sensitivity | None = None
     """At the lines of the measured one."""
     sensitivity_after: Sensitivity | None = None
+    step_before: Step | None = None
+    """With the old parameters; None where the machine would not be stable."""
+    step_predicted: Step | None = None
+    """With the new ones."""
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values."""
@@ -79,6 +113,10 @@ class Comparison:
             "move": move,
             **figures,
             "sensitivity": curves,
+            "step": {
+                name: step.as_dict() if step is not None else None
+                for name, step in (("before", self.step_before), ("predicted", self.step_predicted))
+            },
         }
 
 

@@ -43,7 +43,8 @@ def verification(material: Material) -> Section | None:
     blocks: list[Block] = [
         Table(("axis", "figure", *COLOURS, "unit"), tuple(rows), "The same short test each time.")
     ]
-    plots = [plot for axis in trial.axes for plot in (_move(axis), _sensitivity(axis)) if plot]
+    draw = (_move, _sensitivity, _response, _step)
+    plots = [plot for axis in trial.axes for one in draw if (plot := one(axis))]
     if plots:
         blocks.append(Plots(tuple(plots)))
     if trial.notes:
@@ -91,15 +92,36 @@ def _move(axis: AxisTrial) -> Plot | None:
 
 
 def _sensitivity(axis: AxisTrial) -> Plot | None:
+    return _by_frequency(axis, "size", "sensitivity")
+
+
+def _response(axis: AxisTrial) -> Plot | None:
+    return _by_frequency(axis, "response", "response of the loop")
+
+
+def _by_frequency(axis: AxisTrial, what: str, title: str) -> Plot | None:
     known = {
-        name: (found.frequency, found.size)
+        name: (found.frequency, values)
         for name in COLOURS
         if (found := getattr(axis.sensitivity, name)) is not None
+        and (values := getattr(found, what)) is not None
     }
     if not known:
         return None
-    look = layout("frequency, Hz", "sensitivity", logarithmic=True)
+    look = layout("frequency, Hz", title, logarithmic=True)
     for which, k in (("xaxis", 0), ("yaxis", 1)):
         log_ticks(look[which], np.concatenate([np.array(c[k]) for c in known.values()]))
     figure = {"data": _lines(known), "layout": look}
-    return Plot(figure, f"{axis.axis}: sensitivity, all other loops closed")
+    return Plot(figure, f"{axis.axis}: {title}, all other loops closed")
+
+
+def _step(axis: AxisTrial) -> Plot | None:
+    known = {
+        name: (found.time, found.position)
+        for name in COLOURS
+        if (found := getattr(axis.step, name, None)) is not None
+    }
+    if not known:
+        return None
+    figure = {"data": _lines(known), "layout": layout("time, s", "position over the step")}
+    return Plot(figure, f"{axis.axis}: a step without feed-forward, by the model")

@@ -24,15 +24,17 @@ class Figures(PartModel):
 
 
 class Sensitivity(PartModel):
-    """Frequencies (Hz) and sizes of 1 / (1 + L)."""
+    """Frequencies (Hz) and sizes of 1 / (1 + L), and of L / (1 + L) where it is told."""
 
     frequency: Values
     size: Values
+    response: Values | None = None
 
     @model_validator(mode="after")
     def _of_one_length(self) -> Self:
-        if len(self.frequency) != len(self.size):
-            raise ValueError("frequency and size are not of one length")
+        for values in (self.size, self.response):
+            if values is not None and len(self.frequency) != len(values):
+                raise ValueError("frequency, size and response are not of one length")
         return self
 
 
@@ -42,6 +44,26 @@ class Sensitivities(PartModel):
     before: Sensitivity | None = None
     predicted: Sensitivity | None = None
     after: Sensitivity | None = None
+
+
+class Step(PartModel):
+    """A step of the reference without feed-forward, by the model: time (s), position over its height."""
+
+    time: Values
+    position: Values
+
+    @model_validator(mode="after")
+    def _of_one_length(self) -> Self:
+        if len(self.time) != len(self.position):
+            raise ValueError("time and position are not of one length")
+        return self
+
+
+class Steps(PartModel):
+    """An axis' step with the old and with the new parameters."""
+
+    before: Step | None = None
+    predicted: Step | None = None
 
 
 class Move(PartModel):
@@ -70,6 +92,7 @@ class AxisTrial(PartModel):
     predicted: Figures | None = None
     after: Figures | None = None
     sensitivity: Sensitivities = Sensitivities()
+    step: Steps = Steps()
     curves: Move = Move()
 
 

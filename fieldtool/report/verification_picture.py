@@ -1,4 +1,4 @@
-"""The trial as one PNG: each axis' move and sensitivity before, as predicted, and after."""
+"""The trial as one PNG: each axis' move, sensitivity, response and step before, as predicted, after."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -26,7 +26,7 @@ BANDS = 12.0
 def draw_verification(
     axes: Sequence[tuple[Comparison, History, History]], prediction: Prediction, path: Path
 ) -> None:
-    """Draw move, error at its end, and sensitivity of every axis.
+    """Draw move, error at its end, sensitivity, response and step of every axis.
 
     Parameters
     ----------
@@ -42,15 +42,17 @@ def draw_verification(
     OutputError
         If the file can not be written.
     """
-    figure = Figure(figsize=(13.5, 3.3 * len(axes) + 0.5), layout="constrained")
+    figure = Figure(figsize=(20.0, 3.3 * len(axes) + 0.5), layout="constrained")
     FigureCanvasAgg(figure)
-    plots = figure.subplots(len(axes), 3, squeeze=False)
+    plots = figure.subplots(len(axes), 5, squeeze=False)
     for row, (k, (one, before, after)) in zip(plots, enumerate(axes), strict=True):
         foreseen = foreseen_move(prediction, k)
         _draw_move(row[0], one, before, foreseen, after)
         _draw_error(row[1], one, before, foreseen, after)
-        _draw_sensitivity(row[2], one)
-    for plot in (plots[0, 0], plots[0, 2]):
+        _draw_by_frequency(row[2], one, "size", "sensitivity", 2.0, "2 (6 dB)")
+        _draw_by_frequency(row[3], one, "response", "response of the loop", 0.5**0.5, "-3 dB")
+        _draw_step(row[4], one)
+    for plot in (plots[0, 0], plots[0, 2], plots[0, 3], plots[0, 4]):
         if plot.get_legend_handles_labels()[0]:
             plot.legend(loc="best", fontsize=8)
     save_picture(figure, path, 110)
@@ -157,24 +159,44 @@ def _empty(plot: Axes, title: str, shown: Sequence[object | None]) -> bool:
     return True
 
 
-def _draw_sensitivity(plot: Axes, one: Comparison) -> None:
-    curves = [one.sensitivity_before, one.sensitivity_predicted, one.sensitivity_after]
-    shown = [c for c in curves if c is not None and np.any(c.size > 0)]
-    if _empty(plot, f"{one.axis}: sensitivity", shown):
+def _draw_by_frequency(
+    plot: Axes, one: Comparison, what: str, title: str, level: float, level_name: str
+) -> None:
+    curves = [
+        (name, colour, style, curve.frequency, values)
+        for name, colour, style, curve in (
+            ("before", BEFORE, "-", one.sensitivity_before),
+            ("after", AFTER, "o-", one.sensitivity_after),
+            ("predicted", PREDICTED, "--", one.sensitivity_predicted),
+        )
+        if curve is not None and (values := getattr(curve, what)) is not None
+    ]
+    if _empty(plot, f"{one.axis}: {title}", [v if np.any(v > 0) else None for *_, v in curves]):
         return
-    for name, colour, style, curve in (
-        ("before", BEFORE, "-", one.sensitivity_before),
-        ("after", AFTER, "o-", one.sensitivity_after),
-        ("predicted", PREDICTED, "--", one.sensitivity_predicted),
-    ):
-        if curve is not None:
-            plot.loglog(
-                curve.frequency, curve.size, style, color=colour, lw=1.2, ms=2.5, label=name
-            )
-    plot.axhline(2.0, color=REFERENCE, ls=":", lw=1.0, label="2 (6 dB)")
+    for name, colour, style, frequency, values in curves:
+        plot.loglog(frequency, values, style, color=colour, lw=1.2, ms=2.5, label=name)
+    plot.axhline(level, color=REFERENCE, ls=":", lw=1.0, label=level_name)
     plot.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     plot.xaxis.set_major_formatter(FormatStrFormatter("%g"))
     plot.xaxis.set_minor_formatter(NullFormatter())
-    plot.set_title(f"{one.axis}: sensitivity", loc="left", fontsize=10)
+    plot.set_title(f"{one.axis}: {title}", loc="left", fontsize=10)
     plot.set_xlabel("Hz")
     plot.grid(visible=True, which="both", alpha=0.25)
+
+
+def _draw_step(plot: Axes, one: Comparison) -> None:
+    steps = [
+        ("before", BEFORE, "-", one.step_before),
+        ("predicted", PREDICTED, "--", one.step_predicted),
+    ]
+    title = f"{one.axis}: step without feed-forward, by the model"
+    if _empty(plot, title, [step for *_, step in steps]):
+        return
+    for name, colour, style, step in steps:
+        if step is not None:
+            course = step.as_dict()
+            plot.plot(course["time"], course["position"], style, color=colour, lw=1.4, label=name)
+    plot.axhline(1.0, color=REFERENCE, ls=":", lw=1.0)
+    plot.set_title(title, loc="left", fontsize=10)
+    plot.set_xlabel("s")
+    plot.grid(visible=True, alpha=0.25)

@@ -18,8 +18,9 @@ from fieldtool.design.measured import (
     measured_move,
     measured_sensitivity,
 )
+from fieldtool.design.predict import Prediction
 from fieldtool.design.servo import Servo
-from fieldtool.design.verdict import Comparison
+from fieldtool.design.verdict import Comparison, Step
 from fieldtool.experiment.axes import Axes
 from fieldtool.experiment.verification.excitation import Lines
 from fieldtool.experiment.verification.trial import Tried
@@ -90,6 +91,8 @@ class TrialRecords:
             old_curve,
             expected,
             new_curve,
+            _step(plan.before, k),
+            _step(plan.after, k),
         )
 
     def _sensitivity(self, tried: Tried | None, k: int, servo: Servo) -> Sensitivity | None:
@@ -123,9 +126,8 @@ class TrialRecords:
         if machine.dry and lines is not None:
             return self._rubbing(machine, lines, k)
         response = respond(machine, 2 * np.pi * frequency)
-        return Sensitivity(
-            frequency, np.abs(Loops(response, servos).sensitivity[:, k]).astype(np.float64)
-        )
+        sensitivity = Loops(response, servos).sensitivity[:, k]
+        return Sensitivity.of(frequency, sensitivity.astype(np.complex128))
 
     def _rubbing(self, machine: Machine, lines: Lines, k: int) -> Sensitivity:
         excitation = self.plan.trial.excitation
@@ -180,3 +182,10 @@ class TrialRecords:
         vibration = max(one.residual_peak for one in short)
         moved = replace(axis.move, residual_peak=vibration)
         return axis_figures([moved], axis.peak_torque, curve, latest)
+
+
+def _step(prediction: Prediction, k: int) -> Step | None:
+    axis = prediction.axes[k]
+    if axis.step is None or axis.curves is None:
+        return None
+    return Step(axis.step, axis.curves.step_time, axis.curves.step)

@@ -90,6 +90,14 @@ def test_good_parameters_are_tried_kept_and_compared_on_one_scale(session):
         assert after["vibration"] == pytest.approx(
             predicted["vibration"], rel=0.2, abs=0.05 * axis["move"]["band"]
         )
+        curves = axis["sensitivity"]
+        seen, expected = (np.array(curves[k]["response"]) for k in ("after", "predicted"))
+        assert np.median(np.abs(seen - expected)) < 0.05
+        assert np.median(np.abs(np.array(curves["before"]["response"]) - expected)) > 0.05
+        old, new = (axis["step"][k] for k in ("before", "predicted"))
+        assert old["position"][0] == pytest.approx(0.0, abs=0.02)
+        assert new["position"][-1] == pytest.approx(1.0, abs=0.02)
+        assert min(old["rise_time"], new["rise_time"]) > 0
     raw = load(session.out / "verification.h5")
     assert [e.name.split(": ")[0] for e in raw.experiments] == ["before"] * 3 + ["after"] * 3
     assert (session.out / "verification.png").stat().st_size > 10_000

@@ -70,6 +70,10 @@ def test_the_steps_of_an_offset_do_not_pass_for_the_loop(fresh_rng, stiffness):
     found = measured_sensitivity(signals, servo)
     assert np.abs(found.size / (truth * np.abs(current)) - 1).max() < 0.03
     assert abs(found.peak / truth.max() - 1) < 0.03
+    # what acts has the current loop's own response, which no offset shows without the loop's
+    follows = np.abs(loop / (1 + loop))
+    assert found.response is not None
+    assert np.abs(found.response - follows).max() < 0.03 * max(1.0, follows.max())
 
 
 def test_what_is_taken_off_passes_the_filters_at_its_own_frequency(fresh_rng):
