@@ -5,8 +5,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from drives.canopen_drive import CanopenDrive
+from fieldtool.design.figures import move_figures
 from fieldtool.design.predict import Prediction
 from fieldtool.design.servo import Servo
+from fieldtool.design.verdict import CYCLES, SLOWER, TIME_DOUBT
 from fieldtool.errors import PlanRefusedError
 from fieldtool.experiment.multisine.excitation import signals
 from fieldtool.experiment.multisine.plan import MultisinePlan
@@ -16,6 +18,10 @@ from fieldtool.workflow.trial_loops import drive_loop
 
 NOT_AS_SAID, FASTER_THAN_SAID = 1.25, 1.25
 """Factors by which a peak of sensitivity, and a bandwidth, may be off what the tuning says."""
+BEYOND = 1.1
+"""Times the bound that a peak of sensitivity may be by the model: a measured one would be taken back."""
+EDGE = 1.1
+"""Times the band about the target: what leaves this one does not leave the band by chance."""
 FEWEST_STEPS = 2.0
 """Of a drive's torque, or of its encoder, that an excitation has at least, zero to peak."""
 SETTLED_CYCLES = 24
@@ -91,6 +97,24 @@ def check_present(before: Prediction) -> None:
         )
 
 
+def check_no_worse(before: Prediction, after: Prediction, cycle: float) -> None:
+    """Refuse parameters of which the model says already that the trial would take them back."""
+    for old, new in zip(before.axes, after.axes, strict=True):
+        if old.move is None or new.move is None or new.curves is None:
+            continue
+        curves, band = new.curves, EDGE * new.move.band
+        ways = (curves.position, curves.back)
+        was = old.move.settling_time
+        now = max(move_figures(curves.time, curves.reference, w, band).settling_time for w in ways)
+        if now > (1 + TIME_DOUBT) * SLOWER * was + CYCLES * cycle:
+            settles = f"settle in {now:.3g} s" if np.isfinite(now) else "not settle"
+            raise PlanRefusedError(
+                f"{new.axis}: after the trial's move it would {settles} with the new parameters by the "
+                f"model, in {was:.3g} s with those that are in the drives. Nothing was moved or "
+                "written. Design anew (`fieldtool design`), or write without a trial (--no-verify)."
+            )
+
+
 def check_stable(after: Prediction, bound: float) -> None:
     """Refuse parameters that are not stable by the model, or far beyond the bound."""
     if not after.stable:
@@ -100,7 +124,7 @@ def check_stable(after: Prediction, bound: float) -> None:
         )
     for axis in after.axes:
         peak = axis.margins.sensitivity_peak
-        if peak > 1.2 * bound:
+        if peak > BEYOND * bound:
             raise PlanRefusedError(
                 f"{axis.axis}: with the new parameters its peak of sensitivity would be {peak:.3g} at "
                 f"{axis.margins.peak_frequency:.3g} Hz by the model, {bound:.3g} is allowed. Nothing "

@@ -48,6 +48,7 @@ from fieldtool.report.verification_picture import (
 from fieldtool.workflow.preparation import axes_of, recording_header, setting_of
 from fieldtool.workflow.rescued import keeping
 from fieldtool.workflow.session import Session
+from fieldtool.workflow.trial_checks import check_no_worse
 from fieldtool.workflow.trial_guards import TrialGuards
 from fieldtool.workflow.trial_plan import (
     TrialPlan,
@@ -128,6 +129,8 @@ class Verification:
         self._plan = plan_trial(
             self._group, self._setting, changes, self._bound, self._stated, designed
         )
+        if self._believed and self._tuning.response != SOFTEST:
+            check_no_worse(self._plan.before, self._plan.after, self._plan.trial.cycle_time)
         for note in self._plan.notes:
             self._session.warn(note)
         return self._plan

@@ -311,13 +311,16 @@ def test_a_model_wrong_by_two_is_told_by_the_machine(session, factor):
         assert "predicted" in outcome.err
 
 
-def test_parameters_that_are_slower_than_the_old_ones_are_taken_back(session):
+def test_parameters_that_are_slower_than_the_old_ones_by_the_model_are_not_tried(session):
     gentle = {"position_p": 3.0, "velocity_p": 1.2, "velocity_i": 1.0, "velocity_ff": 0.0}
     slow = {axis: {**own, **gentle} for axis, own in GOOD.items()}
     write_tuning(session, slow)
+    ways = Heard(session)
     outcome = write(session)
-    assert outcome.code == 6, outcome.err
-    assert "with the old parameters" in outcome.err
+    assert outcome.code == 3, outcome.err
+    assert "would settle in" in outcome.err
+    assert "with those that are in the drives" in " ".join(outcome.err.split())
+    assert not ways.enabled
     assert session.changed() == {}
 
 

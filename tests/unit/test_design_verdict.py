@@ -161,3 +161,19 @@ def test_a_path_that_is_left_farther_is_said_and_taken_back_where_nobody_foretol
     if said:
         assert f"up to {error:.3g} rad off its reference, 0.01 rad with the old" in strayed(one)[0]
     assert strayed(replace(one, before=None)) == ()
+
+
+def test_a_peak_that_friction_makes_is_not_asked_of_the_machine() -> None:
+    """The lines of an axis that friction holds show its creep, not its loop."""
+
+    def judged(measured: float, predicted: float, loop: float, bound: float) -> tuple[str, ...]:
+        expected, after = (replace(GOOD, sensitivity_peak=p) for p in (predicted, measured))
+        one = Comparison("x", "rad", 1.0, 0.5, 0.01, GOOD, expected, after, loop_peak=loop)
+        return faults(one, 0.001, bound, believed=True)
+
+    assert judged(1.4, 3.2, 1.2, 1.7) == ()
+    assert judged(1.86, 1.86, 1.36, 1.7) == ()  # as predicted, with friction
+    assert "was predicted" in judged(1.4, 3.2, 3.1, 1.7)[0]  # the loop's own
+    assert "1.7 was wanted" in judged(1.86, 1.6, 1.55, 1.7)[0]
+    assert "was wanted" in judged(2.3, 3.2, 1.2, 1.7)[0]  # no loop may have so much
+    assert "was wanted" in judged(1.86, 1.4, 1.36, 1.7)[0]
