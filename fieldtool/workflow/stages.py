@@ -55,6 +55,8 @@ BAND_POINTS = 400
 """Frequencies at which the band of the model's response is kept."""
 DATA_SHEET_APART = 4.0
 """Tolerances of a motor's inertia that the identified first mass may be apart without a word."""
+AFTER_MEASURING = ("identify", "criticise", "design", "write")
+"""Stages of a run that commands of the same names do as well, from the session folder."""
 BEGIN_ANEW = (
     "Its drives begin anew with every command, holding the gains of the profile: what an earlier one "
     "wrote into them is gone."
@@ -96,7 +98,7 @@ def run(
     options = options or Options()
     begin = time.perf_counter()
     opened: Session | None = None
-    whole = False
+    left: tuple[str, ...] = ()
     try:
         with open_session(machine, out, screen, stop_requested, command="run", options=options) as (
             session,
@@ -104,14 +106,17 @@ def run(
         ):
             opened = session
             machine_time = _measured(session, group, options)
-            whole = True
+            left = AFTER_MEASURING
             identified = _identify(session, options)
+            left = left[1:]
             session.screen.found(identified.model, truth_model(session.machine))
             model, criticism = criticised(session, identified.model, stop_requested)
+            left = left[1:]
             session.screen.stage("Design new controller parameters")
             tuning = _design(
                 session.folder, session.machine, model, options.response, session.screen.doing
             )
+            left = left[1:]
             session.screen.designed(tuning)
             if stop_requested():
                 raise UserStopError(
@@ -132,8 +137,8 @@ def run(
             with suppress(Exception):  # nothing may hide why it ended
                 report(opened.folder.path)
             stopped = isinstance(error, UserStopError | KeyboardInterrupt)
-            if whole and stopped and opened.write_back is None:
-                error.add_note(_rest_of(opened.folder, options))
+            if left and stopped and opened.write_back is None:
+                error.add_note(_rest_of(opened.folder, options, left))
         raise
     with noting(write_back.way_back):
         _reported(session)
@@ -331,18 +336,17 @@ def restore(
     return restored
 
 
-def _rest_of(folder: SessionFolder, options: Options) -> str:
-    """Return the commands that do what a run that was stopped has left undone."""
+def _rest_of(folder: SessionFolder, options: Options, left: Sequence[str]) -> str:
+    """Return the commands of the stages that a run which was stopped has left undone.
+
+    Files do not tell: an earlier run's may lie in the folder, and a criticism may have been refused.
+    """
     motors = " --motor-inertia data-sheet" if options.motor_inertia == "data sheet" else ""
     response = f" --response {options.response}" if options.response != "normal" else ""
-    stages = (
-        (folder.model, f"`fieldtool identify {folder.path}{motors}`, "),
-        (folder.criticism, f"`fieldtool criticise {folder.path}`, "),
-        (folder.tuning, f"`fieldtool design {folder.path}{response}`, then "),
-    )
-    made = max((k + 1 for k, (file, _) in enumerate(stages) if file.is_file()), default=0)
-    left = "".join(command for _, command in stages[made:])
-    return f"To go on without measuring again: {left}`fieldtool write {folder.path}`."
+    asked = {"identify": motors, "design": response}
+    *before, last = (f"`fieldtool {stage} {folder.path}{asked.get(stage, '')}`" for stage in left)
+    then = f"{', '.join(before)}, then " if before else ""
+    return f"To go on without measuring again: {then}{last}."
 
 
 def _rescued(folder: SessionFolder, screen: Screen) -> None:

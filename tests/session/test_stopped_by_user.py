@@ -18,6 +18,7 @@ from drives.errors import UserStopError
 from drives.sim.faults import Fault
 from fieldtool import workflow
 from fieldtool.cli.output import nobody_reads
+from fieldtool.errors import NotEnoughDataError
 from fieldtool.records.recording import load
 from fieldtool.workflow import Options
 
@@ -139,12 +140,18 @@ def test_between_measuring_and_writing(small_bench, monkeypatch, module, name, c
     assert small_bench.recording().experiments[-1].complete, "the data are kept"
 
 
+def commands_to_go_on(outcome):
+    told = " ".join(outcome.err.split()).partition("To go on without measuring again: ")[2]
+    return [command.split() for command in re.findall(r"`fieldtool ([^`]*)`", told)]
+
+
 @pytest.mark.usefixtures("quick_plan", "untried")
 @pytest.mark.parametrize(
     ("module", "name", "left"),
     [
         ("stages", "identify_recording", ["identify", "criticise", "design", "write"]),
         ("stages", "criticised", ["criticise", "design", "write"]),
+        ("criticising", "draw_criticism", ["criticise", "design", "write"]),
         ("stages", "designed", ["design", "write"]),
         ("writing", "apply", ["write"]),
     ],
@@ -154,11 +161,12 @@ def test_what_a_stop_left_undone_is_done_by_the_commands_that_are_named(
 ):
     monkeypatch.setattr(import_module("fieldtool.cli.stop_key"), "ASKED_WITHIN", -1.0)
     pressing_during(monkeypatch, import_module(f"fieldtool.workflow.{module}"), name)
+    small_bench.out.mkdir()
+    (small_bench.out / "tuning.yaml").write_text("of an older run")
     outcome = small_bench.run("--write", "--yes", "--response", "soft")
     assert outcome.code == 130, outcome.err
     assert "No whole experiment" not in outcome.err
-    told = " ".join(outcome.err.split()).partition("To go on without measuring again: ")[2]
-    commands = [command.split() for command in re.findall(r"`fieldtool ([^`]*)`", told)]
+    commands = commands_to_go_on(outcome)
     assert [command[0] for command in commands] == left
     for command in commands:
         answers = ("--yes",) if command[0] == "write" else ()
@@ -166,6 +174,18 @@ def test_what_a_stop_left_undone_is_done_by_the_commands_that_are_named(
         assert again.code == 0, again.err
     assert "response: soft" in (small_bench.out / "tuning.yaml").read_text()
     assert small_bench.changed() != {}
+
+
+@pytest.mark.usefixtures("quick_plan")
+def test_a_criticism_that_was_refused_is_not_named_again(small_bench, monkeypatch):
+    def refused(*_, **__):
+        raise NotEnoughDataError("nothing can be compared")
+
+    monkeypatch.setattr("fieldtool.workflow.criticising.criticise", refused)
+    pressing_during(monkeypatch, import_module("fieldtool.workflow.stages"), "designed")
+    outcome = small_bench.run("--yes")
+    assert outcome.code == 130, outcome.err
+    assert [command[0] for command in commands_to_go_on(outcome)] == ["design", "write"]
 
 
 @pytest.mark.parametrize("plan", ["fast", "classic"])
