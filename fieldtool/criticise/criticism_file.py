@@ -142,17 +142,27 @@ def read_criticism(path: Path, model: MachineModel) -> Criticism:
         tuple(data.changes),
         model,
         data.band_hz,
-        judged or {name: _as_unseen(held, name) for name in held.error_before},
+        judged or {name: _as_unseen(data, name) for name in held.error_before},
         tuple(data.notes),
     )
 
 
-def _as_unseen(held: _HeldOut, name: str) -> Judged:
-    """Return what a file without ``judged`` says of an axis; which axes decided, it does not."""
+def _as_unseen(data: _Criticism, name: str) -> Judged:
+    """Return what a file without ``judged`` says of an axis.
+
+    Which axes decided, it does not say.  It may be all of which something is unexplained, and all with
+    causes where these explain only a part: none is then said to be explained that may not be.
+    """
+    held = data.held_out
+    of_causes = {axis for c in data.causes for axis in _cause(c).axes}
+    decides = (data.verdict == "partly explained" and name in of_causes) or (
+        data.verdict in ("partly explained", "unexplained")
+        and any(s.startswith(f"{name}: ") for s in data.unexplained)
+    )
     before, after = held.error_before[name].torque, held.error_after[name].torque
     if before is None:
-        return Judged("nothing", None, None, None, decides=False)
-    return Judged("unseen", before, after, held.noise_floor[name], decides=False)
+        return Judged("nothing", None, None, None, decides)
+    return Judged("unseen", before, after, held.noise_floor[name], decides)
 
 
 def _cause(data: _Cause) -> Cause:

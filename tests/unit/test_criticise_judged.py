@@ -210,4 +210,44 @@ def test_what_axes_are_judged_by_is_read_back_and_files_without_it_are_read(apar
     assert {n: (j.data, j.after) for n, j in old.judged.items()} == {
         n: (j.data, j.after) for n, j in apart.judged.items()
     }
-    assert "The verdict is: unexplained" in verdict(Material("x", criticism=old))[0]
+    words, _ = verdict(Material("x", criticism=old))
+    assert f"wrong by {shown(apart.judged['a'].before)} of the torque of a on unseen data" in words
+
+
+def without_judged(criticism, folder, still=""):
+    """Return it as a file reads that has no ``judged``, and no torque of the axis that is ``still``."""
+    plain = criticism.as_dict()
+    del plain["judged"]
+    for errors in (plain["held_out"]["error_before"], plain["held_out"]["error_after"]):
+        if still:
+            errors[still]["torque"] = None
+    write_yaml(folder / "criticism.yaml", plain)
+    return read_criticism(folder / "criticism.yaml", criticism.model)
+
+
+@pytest.mark.parametrize("unexplained", [(), ("b: 3 % of the torque is not explained",)])
+def test_a_file_without_judged_never_says_whole_of_what_is_explained_in_part(
+    apart, tmp_path, unexplained
+):
+    partly = replace(apart, verdict="partly explained", causes=(CAUSE,), unexplained=unexplained)
+    words, _ = verdict(Material("x", criticism=without_judged(partly, tmp_path)))
+    assert "explains it in part: " in words
+    assert all(f"{sentence}." in words for sentence in unexplained)
+    whole = replace(partly, verdict="explained")
+    words, _ = verdict(Material("x", criticism=without_judged(whole, tmp_path)))
+    assert "explains it: " in words
+
+
+@pytest.mark.parametrize("causes", [(), (CAUSE,)])
+def test_a_file_without_judged_keeps_what_it_says_of_an_axis_without_torque(
+    apart, tmp_path, causes
+):
+    sentence = "b: 12 % of the torque of all data is not explained"
+    left = replace(
+        apart,
+        verdict="partly explained" if causes else "unexplained",
+        causes=causes,
+        unexplained=(sentence,),
+    )
+    words, _ = verdict(Material("x", criticism=without_judged(left, tmp_path, still="b")))
+    assert f"{sentence}." in words
