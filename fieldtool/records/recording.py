@@ -45,6 +45,7 @@ __all__ = [
     "grid_fault",
     "load",
     "save",
+    "whole_kinds",
 ]
 
 FORMAT = "fieldtool-recording/1"
@@ -152,6 +153,19 @@ def recorded_seconds(path: Path) -> float:
         if not 0.0 <= seconds < inf:
             raise reader.fault(f"{rows} rows of one 'sample_period' are {seconds} s.")
         return seconds
+
+
+def whole_kinds(path: Path) -> set[str]:
+    """Return the kinds of the experiments that came to their end; no signal is read.
+
+    Raises
+    ------
+    FileFormatError
+        As :func:`load`.
+    """
+    with opened(path, FORMAT) as reader:
+        experiments = reader.child("experiments").children()
+        return {one.text("kind") for one in experiments if one.number("complete")}
 
 
 def load(path: Path | str) -> Recording:

@@ -11,19 +11,20 @@ import yaml
 
 from drives.bus import not_imitated
 from drives.canopen_drive import CanopenGroup
+from drives.canopen_drive.interrupts import uninterrupted
 from drives.parameters import Change, Written
 from drives.profile import MachineProfile, load_machine
 from drives.trace import trace_problem
 from fieldtool.criticise.criticism import Criticism
 from fieldtool.design.tuning import Tuning
-from fieldtool.errors import FieldtoolError, OutputError
+from fieldtool.errors import OutputError
 from fieldtool.experiment.forecast import AxisForecast
 from fieldtool.experiment.multisine.runner import MultisineProgress
 from fieldtool.experiment.stepped.plan import SweepPlan
 from fieldtool.experiment.stepped.runner import Progress
 from fieldtool.identify.recorded import Identified
 from fieldtool.records.model import MachineModel
-from fieldtool.records.recording import load
+from fieldtool.records.recording import whole_kinds
 from fieldtool.records.session_folder import SessionFolder
 from fieldtool.records.yaml_file import write_yaml
 from fieldtool.workflow.planning import PlannedFast
@@ -270,11 +271,12 @@ def open_session(
                     f"reached again: fieldtool restore {folder.path}"
                 )
     except BaseException as error:
-        folder.note("ended", error=type(error).__name__, text=str(error))
-        if session.write_back is not None and session.write_back.way_back:
-            error.add_note(session.write_back.way_back)
-        if not keep_profile and folder.recording.is_file():
-            error.add_note(_kept(folder))
+        with uninterrupted():  # nothing may hide why it ended
+            folder.note("ended", error=type(error).__name__, text=str(error))
+            if session.write_back is not None and session.write_back.way_back:
+                error.add_note(session.write_back.way_back)
+            if not keep_profile and folder.recording.is_file():
+                error.add_note(_kept(folder))
         raise
     folder.note("ended")
 
@@ -285,10 +287,9 @@ def _kept(folder: SessionFolder) -> str:
         f"What was measured is kept in {folder.path}: `fieldtool report {folder.path}` shows it."
     )
     try:
-        experiments = load(folder.recording).experiments
-    except FieldtoolError:
-        return words
-    if any(one.complete and one.kind in ("multisine", "stepped_sine") for one in experiments):
+        if whole_kinds(folder.recording) & {"multisine", "stepped_sine"}:
+            return words
+    except Exception:  # of whatever kind: why the session ended says more
         return words
     return (
         f"{words} No whole experiment that excites the axes is in it, so no machine can be identified "

@@ -15,11 +15,11 @@ import yaml
 from drives.canopen_drive import CanopenDrive, CanopenMotion
 from drives.canopen_drive.interrupts import SIGNALS, uninterrupted
 from drives.errors import UserStopError
-from drives.sim.faults import Fault
+from drives.sim.faults import DriveFault, Fault
 from fieldtool import workflow
 from fieldtool.cli.output import nobody_reads
 from fieldtool.errors import NotEnoughDataError
-from fieldtool.records.recording import load
+from fieldtool.records.recording import load, whole_kinds
 from fieldtool.workflow import Options
 
 CLASSIC = Options(plan="classic")
@@ -198,6 +198,33 @@ def test_data_of_a_stopped_direction_check_are_said_to_be_of_no_use(bench, plan)
     assert "To go on" not in said
     assert bench.command("identify", bench.out).code == 5
     is_safe(bench)
+
+
+def out_of_memory():
+    raise MemoryError
+
+
+def press():
+    signal.raise_signal(signal.SIGINT)
+
+
+@pytest.mark.parametrize("happen", [out_of_memory, press])
+def test_nothing_hides_why_a_session_ended_while_it_is_said_what_is_kept(
+    small_bench, monkeypatch, happen
+):
+    def reading(path):
+        happen()
+        return whole_kinds(path)
+
+    monkeypatch.setattr(import_module("fieldtool.cli.stop_key"), "ASKED_WITHIN", -1.0)
+    monkeypatch.setattr("fieldtool.workflow.session.whole_kinds", reading)
+    small_bench.inject(DriveFault(TABLE), CHECKING // 2)
+    outcome = small_bench.measure()
+    assert outcome.code == 4, outcome.err
+    said = " ".join(outcome.err.split())
+    assert "reports emergency 0x2310" in said
+    assert f"What was measured is kept in {small_bench.out}: " in said
+    assert ("No whole experiment" in said) == (happen is press)
 
 
 @pytest.mark.usefixtures("quick_plan", "untried")

@@ -4,6 +4,7 @@ import errno
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -22,6 +23,7 @@ from fieldtool.records.recording import (
     load,
     recorded_seconds,
     save,
+    whole_kinds,
 )
 from tests.seeds import fresh_seed
 
@@ -338,6 +340,17 @@ def test_the_seconds_of_a_recording_are_those_of_its_rows(tmp_path: Path) -> Non
     save(recording, tmp_path / "r.h5")
     rows = sum(e.samples for e in recording.experiments)
     assert recorded_seconds(tmp_path / "r.h5") == pytest.approx(rows * recording.sample_period)
+
+
+def test_the_kinds_of_whole_experiments_are_those_of_experiments_that_ended(tmp_path: Path) -> None:
+    recording = random_recording(7)
+    kinds = ("multisine", "moves", "stepped_sine")
+    experiments = tuple(
+        replace(recording.experiments[0], name=kind, kind=kind, complete=kind != "multisine")
+        for kind in kinds
+    )
+    save(replace(recording, experiments=experiments), tmp_path / "r.h5")
+    assert whole_kinds(tmp_path / "r.h5") == {"moves", "stepped_sine"}
 
 
 @pytest.mark.parametrize(
