@@ -89,8 +89,23 @@ def show_tuning(console: Console, tuning: Tuning) -> None:
     if tuning.prediction is not None:
         for table in _tables(tuning, console.width):
             console.print(table)
+        if sentence := together(tuning):
+            console.print(indented(sentence))
     for sentence in (*(one.sentence for one in tuning.shaping), *tuning.notes):
         console.print(indented(f"{sentence}"))
+
+
+def together(tuning: Tuning) -> str:
+    """Say what the peak of sensitivity is if the loops of all axes change at the same time."""
+    new, now = tuning.prediction, tuning.present
+    if new is None or len(new.axes) < 2:
+        return ""
+    peaks = [f"{one.sensitivity_peak:.3g}" for one in (new, now) if one is not None]
+    before = f", {peaks[1]} before" if now is not None else ""
+    return (
+        f"All axes together: largest singular value of their sensitivity {peaks[0]}{before}. The bound "
+        "is that of each axis with the loops of all others closed."
+    )
 
 
 def _tables(tuning: Tuning, width: int) -> list[Sheet]:

@@ -60,6 +60,13 @@ class Machine:
     """Dry friction, which no response in frequency has."""
 
     @property
+    def inertias(self) -> FloatArray:
+        """All masses of each axis, from its motor to its last one, kg m2 or kg, shape (M,)."""
+        own = np.diag(self.mass)
+        chains = zip(self.motors, self.loads, strict=True)
+        return np.array([own[first : last + 1].sum() for first, last in chains])
+
+    @property
     def modes(self) -> FloatArray:
         """Undamped elastic modes of the free machine, rad/s, rising; empty where it is rigid."""
         values = eigh(self.stiffness, self.mass, eigvals_only=True)

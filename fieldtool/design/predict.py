@@ -80,7 +80,8 @@ class Prediction:
     axes: tuple[AxisPrediction, ...]
     stable: bool
     sensitivity_peak: float
-    """Largest singular value of the sensitivity of all loops together, at the motors' torques."""
+    """Largest singular value of the sensitivity of all loops together, at the motors' torques, each over
+    the root of its axis' inertia, so that no unit matters: for loops that change at the same time."""
 
     def of(self, axis: str) -> AxisPrediction:
         """Return one axis by name; KeyError where there is none."""
@@ -156,7 +157,9 @@ def predict(
                 motion.beside if motion else None,
             )
         )
-    peak = sensitivity_peak(loops.input_sensitivity) if steady else inf
+    root = np.sqrt(machine.inertias)
+    together = loops.input_sensitivity * (root[None, :] / root[:, None])
+    peak = sensitivity_peak(together) if steady else inf
     return Prediction(tuple(axes), steady, peak)
 
 

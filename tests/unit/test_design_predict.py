@@ -130,6 +130,43 @@ def test_stability_and_sensitivity_as_the_eigenvalues_say(
     assert margin == pytest.approx(low, rel=0.05)
 
 
+def test_the_peak_of_all_loops_together_has_no_unit(
+    random_model: RandomModel, fresh_rng: np.random.Generator
+) -> None:
+    """One axis told in another unit of length: its masses, gains and couplings are other numbers."""
+    model = random_model(fresh_rng, (1, 2))
+    machine, unit = machine_of(model), float(fresh_rng.uniform(10.0, 1000.0))
+    scale = np.where(np.arange(machine.mass.shape[0]) < machine.motors[1], 1.0, unit)
+    both = np.outer(scale, scale)
+    parts = {n: getattr(machine, n) * both for n in ("mass", "damping", "stiffness", "loss")}
+    loops, moves = rule(model), moves_of(model)
+    second = loops[1]
+    told = replace(
+        second,
+        velocity_p=unit**2 * second.velocity_p,
+        velocity_i=unit**2 * second.velocity_i,
+        inertia_ff=unit**2 * second.inertia_ff,
+    )
+    timing = Timing(1e-3, 1e-3)
+    way = moves[1]
+    short = replace(
+        way,
+        distance=way.distance / unit,
+        velocity=way.velocity / unit,
+        acceleration=way.acceleration / unit,
+        jerk=way.jerk / unit,
+    )
+    peaks = [
+        predict(one, [Servo(x, 500.0, timing) for x in both_loops], both_moves).sensitivity_peak
+        for one, both_loops, both_moves in (
+            (machine, loops, moves),
+            (replace(machine, **parts), (loops[0], told), [moves[0], short]),
+        )
+    ]
+    assert peaks[0] > 1.0
+    assert peaks[1] == pytest.approx(peaks[0], rel=1e-3)
+
+
 def test_the_delay_of_the_state_space_is_that_of_the_frequency_response() -> None:
     """exp(A t) of the closed loops against the inverse transform of the frequency response."""
     chain = AxisModel(
