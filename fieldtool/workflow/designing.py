@@ -4,9 +4,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from drives.errors import ProfileError
-from drives.parameters import load_journal
-from drives.parameters.journal import State
 from drives.profile import MachineProfile, load_machine
 from fieldtool.design.decide import design
 from fieldtool.design.tuning import BOUND, Tuning
@@ -19,6 +16,7 @@ from fieldtool.records.yaml_file import write_yaml
 from fieldtool.report.design_picture import draw_design
 from fieldtool.workflow.design_inputs import drive_sides, moves_of
 from fieldtool.workflow.models import model_of
+from fieldtool.writeback.earlier import written_since
 
 NOT_KNOWN = 0.3
 """Relative standard error of a mass or spring from which no controller is designed."""
@@ -87,19 +85,10 @@ def designed(
         top=_top(folder),
         advance=advance,
     )
-    if tuning.present is not None and _wrote(folder):
+    if tuning.present is not None and written_since(folder.journal):
         tuning = replace(tuning, notes=(SINCE, *tuning.notes))
     write_yaml(folder.tuning, tuning_as_dict(tuning))
     return tuning
-
-
-def _wrote(folder: SessionFolder) -> bool:
-    """Whether the drives were written from this session, and not all of it was taken back."""
-    try:
-        journal = load_journal(folder.journal)
-    except (ProfileError, OSError):
-        return False
-    return journal.writes and journal.state is not State.OLD
 
 
 def machine_kinds(model: MachineModel) -> dict[str, str]:

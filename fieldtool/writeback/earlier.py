@@ -10,6 +10,7 @@ from pathlib import Path
 from drives.errors import ProfileError, WrongDeviceError
 from drives.parameters import DriveRecord, Journal, Memory, load_backup, load_journal
 from drives.parameters.guard import other_number
+from drives.parameters.journal import State
 from drives.parameters.values import ParameterDrive
 
 FIRST_BACKUP = "parameters-before.yaml"
@@ -47,6 +48,19 @@ def refuse_other_drives(backup_file: Path, drives: Iterable[ParameterDrive]) -> 
                 "that they were designed for. Were node ids swapped? If a drive was exchanged on "
                 "purpose, measure the machine again: fieldtool run. Nothing was moved or written."
             )
+
+
+def written_since(journal_file: Path) -> bool:
+    """Whether drives were written after the first backup, and are not known to hold its values again.
+
+    A write that was taken back has brought its own backup back, which may be a later one.
+    """
+    try:
+        journal = load_journal(journal_file)
+    except (ProfileError, OSError):
+        return False
+    is_back = journal.state is State.OLD and journal.backup == FIRST_BACKUP
+    return journal.writes and not is_back
 
 
 def left_before(journal_file: Path, drives: Iterable[ParameterDrive]) -> Mapping[str, Memory]:

@@ -545,7 +545,11 @@ def test_the_report_knows_of_a_restore_from_a_file_of_the_session(session, name,
     assert said in text
 
 
-def test_a_design_after_a_write_says_of_when_its_present_parameters_are(bench):
+def unproven(_):
+    raise NotVerifiedError("the new parameters do not stand their trial: test")
+
+
+def test_a_design_after_a_write_says_of_when_its_present_parameters_are(bench, monkeypatch):
     def since():
         outcome = bench.command("design", bench.out, "--response", "soft", "--json")
         assert outcome.code == 0, outcome.err
@@ -556,6 +560,11 @@ def test_a_design_after_a_write_says_of_when_its_present_parameters_are(bench):
 
     begun(bench)
     assert write(bench).code == 0
+    assert since() == 1
+    with monkeypatch.context() as patch:
+        patch.setattr(Stood, "prove", unproven)
+        assert write(bench).code == 6, "the drives keep what the first write brought"
+    assert bench.changed() != {}
     assert since() == 1
     assert bench.command("restore", bench.out).code == 0
     assert since() == 0
