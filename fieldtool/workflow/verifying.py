@@ -60,6 +60,7 @@ from fieldtool.workflow.trial_plan import (
 )
 from fieldtool.workflow.trial_records import TrialRecords
 from fieldtool.workflow.verified import Verdict, Verified
+from fieldtool.writeback.earlier import other_than_first
 from fieldtool.writeback.temporary import backed_up
 
 TRIALS = 3
@@ -151,7 +152,7 @@ class Verification:
         )
         self._session.screen.say(_what_moves(plan, self._axes))
         name, path = self._session.machine.name, self._session.folder.parameters_before
-        with backed_up(name, self._group.drives, path), self._recording() as keep:
+        with backed_up(name, self._group.drives, path) as held, self._recording() as keep:
             try:
                 self._old = self._run("before", keep, trusts_loops=True)
             except (OscillationError, IdentificationError) as error:
@@ -162,6 +163,8 @@ class Verification:
                     "another one pushes it away, raise velocity_i and position_p. Then measure and "
                     "design anew: `fieldtool run`."
                 )
+                if note := other_than_first(held):
+                    error.add_note(note)
                 raise
 
     def prove(self) -> None:

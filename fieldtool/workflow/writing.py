@@ -22,7 +22,11 @@ from fieldtool.records.model import MachineModel
 from fieldtool.workflow.session import Options, Session, parameter_table
 from fieldtool.workflow.verified import Verified
 from fieldtool.workflow.verifying import Verification
-from fieldtool.writeback.earlier import refuse_other_drives
+from fieldtool.writeback.earlier import (
+    may_be_stored,
+    refuse_other_drives,
+    written_since,
+)
 from fieldtool.writeback.transaction import WriteBack, apply, changes_for
 
 Confirm = Callable[[Sequence[Change]], bool]
@@ -63,7 +67,8 @@ def written(
     WrongDeviceError
         If the session was begun on other drives.
     PlanRefusedError
-        If something is to be stored untried, or the new parameters are bad by the model.
+        If something is to be stored untried, the new parameters are bad by the model, or the drives
+        hold them already since an earlier write: there would be nothing to compare them with.
     OscillationError
         If an axis swings with its old parameters; nothing was written.
     WriteBackError, WriteBackMixedError
@@ -99,7 +104,16 @@ def written(
             session.warn(
                 f"CAREFUL, the new parameters are for a trial only: {verification.not_stored}."
             )
-        verification.plan(changes_for(group.drives, tuning))
+    changes = changes_for(group.drives, tuning)
+    again = _again(session, store=not never)
+    if written_since(session.folder.journal) and not any(change.differs for change in changes):
+        raise PlanRefusedError(
+            "the drives hold these parameters already, since a write of this session, so that a trial "
+            f"would compare them with themselves. To have them tried against the old ones: {again}. "
+            "Nothing was moved or written."
+        )
+    if verification is not None:
+        verification.plan(changes)
 
     def agreed(changes: Sequence[Change]) -> bool:
         with _before_the_write():
@@ -132,8 +146,7 @@ def written(
         raise
     with uninterrupted():  # a stop waits until it stands in the folder what the drives hold
         if not never:
-            keep = f"`fieldtool write {session.folder.path} --store`, which tries them once more"
-            result = replace(result, to_store=keep)
+            result = replace(result, to_store=f"{again}, which tries them once more")
         session.write_back = result
         if verification is not None:
             verification.ended(None, State.NEW if result.in_memory else State.OLD)
@@ -155,6 +168,14 @@ def _before_the_write() -> Iterator[None]:
         if not isinstance(error, OscillationError):  # which says so
             error.add_note("That was before the write: nothing was written.")
         raise
+
+
+def _again(session: Session, *, store: bool) -> str:
+    """Return the commands that try new parameters against those from before the first write."""
+    folder = session.folder
+    back = " --store" if may_be_stored(folder.journal) else ""
+    keep = " --store" if store else ""
+    return f"`fieldtool restore {folder.path}{back}`, then `fieldtool write {folder.path}{keep}`"
 
 
 def _forget_earlier(session: Session) -> None:

@@ -63,6 +63,32 @@ def written_since(journal_file: Path) -> bool:
     return journal.writes and not is_back
 
 
+def other_than_first(backup: Path) -> str:
+    """Say that drives hold other values than before a folder's first write; empty where they do not.
+
+    Parameters
+    ----------
+    backup
+        In that folder, of what they hold now.
+    """
+    if backup.name == FIRST_BACKUP:
+        return ""
+    return (
+        f"The drives hold what they held before this write, not what is in {FIRST_BACKUP}, from before "
+        f"the first write of this session: `fieldtool restore {backup.parent}` brings that back."
+    )
+
+
+def may_be_stored(journal_file: Path) -> bool:
+    """Whether a drive's non-volatile memory holds, or may hold, other values than the first backup's."""
+    try:
+        journal = load_journal(journal_file)
+    except (ProfileError, OSError):
+        return False
+    held = {memory_seen_from(FIRST_BACKUP, journal, record) for record in journal.drives}
+    return not held <= {Memory.UNTOUCHED, Memory.OLD}
+
+
 def left_before(journal_file: Path, drives: Iterable[ParameterDrive]) -> Mapping[str, Memory]:
     """Return what each drive's non-volatile memory is known to hold before a new journal, by axis.
 

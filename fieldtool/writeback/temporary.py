@@ -16,7 +16,7 @@ from fieldtool.writeback.unfinished import JOURNAL, JournalKeeper, not_kept
 
 
 @contextmanager
-def backed_up(machine: str, drives: Sequence[CanopenDrive], backup_path: Path) -> Iterator[None]:
+def backed_up(machine: str, drives: Sequence[CanopenDrive], backup_path: Path) -> Iterator[Path]:
     """Back all parameters up, and leave a note for as long as the drives may hold others.
 
     A measurement switches feed-forward off, arms fail-safe objects and maps PDOs, and puts all of it
@@ -25,6 +25,7 @@ def backed_up(machine: str, drives: Sequence[CanopenDrive], backup_path: Path) -
     next session ask for ``fieldtool restore``, so that no later backup takes such values for the
     machine's own.
     The journal of a write that has ended is put back afterwards: it says what the drives have stored.
+    Gives the backup's file.
 
     Raises
     ------
@@ -44,7 +45,7 @@ def backed_up(machine: str, drives: Sequence[CanopenDrive], backup_path: Path) -
         except OSError as error:
             raise not_kept(keeper, error) from error
         try:
-            yield
+            yield backup
         finally:
             for drive in drives:
                 drive.left_changed |= drive.boots != boots[drive.axis]

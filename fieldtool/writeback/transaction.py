@@ -30,7 +30,7 @@ from drives.parameters.values import same
 from drives.profile import Store
 from fieldtool.design.tuning import Tuning
 from fieldtool.writeback.backups import keep_backup
-from fieldtool.writeback.earlier import left_before
+from fieldtool.writeback.earlier import left_before, other_than_first
 from fieldtool.writeback.unfinished import JOURNAL, JournalKeeper, not_kept, refuse_unfinished
 
 Confirm = Callable[[Sequence[Change]], bool]
@@ -185,6 +185,8 @@ def apply(
     except BaseException as error:
         if transaction.journal.state is State.NEW:
             error.add_note(result.way_back)
+        elif transaction.journal.state is State.OLD and (note := other_than_first(backup_path)):
+            error.add_note(note)
         raise
     return result
 

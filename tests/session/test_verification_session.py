@@ -14,7 +14,7 @@ import pytest
 import yaml
 
 from drives.canopen_drive.motion import CanopenMotion
-from drives.errors import NotVerifiedError
+from drives.errors import NotVerifiedError, OscillationError
 from drives.sim.faults import EncoderStuck, Fault, MotorReversed
 from drives.sim.firmware import Parameter
 from fieldtool.errors import PlanRefusedError
@@ -103,19 +103,51 @@ def test_good_parameters_are_tried_kept_and_compared_on_one_scale(session):
     assert (session.out / "verification.png").stat().st_size > 10_000
 
 
-def test_what_was_written_is_stored_by_the_command_that_is_named(session):
+def test_what_was_written_is_stored_by_the_commands_that_are_named(session):
+    """And compared with what was there before, not with itself."""
     said = " ".join(write(session).out.split())
-    command = re.search(r"To keep them: `fieldtool ([^`]*)`", said)
-    assert command is not None, said
+    commands = r"`fieldtool (restore [^`]*)`, then `fieldtool (write [^`]*)`"
+    named = re.search(rf"To keep them: {commands}, which tries them once more", said)
+    assert named is not None, said
     new, was = session.objects()[TABLE][VELOCITY_P], session.before[TABLE][VELOCITY_P]
     assert new != was
-    stored = session.command(*command[1].split(), "--yes")
+    found = verification(session)
+    session.listen()
+    itself = write(session, "--store")
+    assert itself.code == 3, itself.err
+    again = re.search(rf"compare them with themselves.* old ones: {commands}", itself.err)
+    assert again is not None, itself.err
+    assert again.groups() == named.groups()
+    assert not [f for f in session.heard() if f.cob_id == 0x80], "no SYNC: nothing moved"
+    assert verification(session) == found
+    assert session.command(*named[1].split()).code == 0
+    stored = session.command(*named[2].split(), "--yes")
     assert stored.code == 0, stored.err
+    assert {one["before"] for one in verification(session)["parameters"]} == {
+        one["before"] for one in found["parameters"]
+    }
     for node in session.machine.nodes:
         node.power_cycle()
     assert session.objects()[TABLE][VELOCITY_P] == new
     assert session.command("restore", session.out, "--store").code == 0
     assert session.objects()[TABLE][VELOCITY_P] == was
+
+
+def test_where_what_was_written_swings_the_way_back_is_named(session, monkeypatch):
+    """In the trial of the old parameters, which an earlier write has brought."""
+
+    def swings(*_, **__):
+        raise OscillationError("table: swings")
+
+    monkeypatch.setattr(verifying.Verification, "_run", swings)
+    way_back = f"`fieldtool restore {session.out}` brings that back"
+    assert way_back not in " ".join(write(session).err.split())
+    assert write(session, "--no-verify").code == 0
+    faster = {axis: {**own, "velocity_p": 1.1 * own["velocity_p"]} for axis, own in GOOD.items()}
+    write_tuning(session, faster)
+    outcome = write(session)
+    assert outcome.code == 4, outcome.err
+    assert way_back in " ".join(outcome.err.split())
 
 
 def test_dry_friction_in_the_model_is_reckoned_with_in_the_trial(make_bench, profile_of_two):

@@ -495,6 +495,41 @@ def test_a_second_write_does_not_lose_the_first_backup(session):
     assert session.changed() == {}
 
 
+def test_where_a_later_write_fails_the_way_back_to_the_first_backup_is_named(session, monkeypatch):
+    """Once more written, what the drives hold would be compared with itself: that is refused."""
+    assert write(session).code == 0
+    first = session.changed()
+    write_tuning(session, {"velocity_p": 3.0})
+    monkeypatch.setattr(Stood, "prove", unproven)
+    outcome = write(session)
+    assert outcome.code == 6, outcome.err
+    assert session.changed() == first
+    named = re.search(r"not what is in .*`fieldtool (restore [^`]*)` brings that", outcome.err)
+    assert named is not None, outcome.err
+    write_tuning(session, NEW)
+    again = write(session)
+    assert again.code == 3, again.err
+    assert "with themselves" in again.err
+    assert session.command(*named[1].split()).code == 0
+    assert session.changed() == {}
+    failed = write(session)
+    assert failed.code == 6, failed.err
+    assert "not what is in" not in failed.err, "all is as it was before the first write"
+
+
+def test_the_way_to_the_old_values_stores_them_where_new_ones_are_stored(session):
+    assert "--store" not in named_restore(write(session).out)
+    assert session.command("restore", session.out).code == 0
+    assert write(session, "--store").code == 0
+    assert "--store" in named_restore(write(session).err)
+    assert session.command("restore", session.out).code == 0, "in working memory"
+    assert "--store" in named_restore(write(session).out)
+
+
+def named_restore(said):
+    return re.search(r"`fieldtool (restore [^`]*)`", " ".join(said.split()))[1]
+
+
 def test_no_backup_no_write(session):
     (session.out / "parameters-before.yaml.part").mkdir()
     outcome = write(session)
