@@ -146,7 +146,8 @@ def written(
         raise
     with uninterrupted():  # a stop waits until it stands in the folder what the drives hold
         if not never:
-            result = replace(result, to_store=f"{again}, which tries them once more")
+            more = " once more" if verification is not None else ""
+            result = replace(result, to_store=f"{again}, which tries them{more}")
         session.write_back = result
         if verification is not None:
             verification.ended(None, State.NEW if result.in_memory else State.OLD)

@@ -205,6 +205,7 @@ def test_untried_parameters_are_said_to_be_so(session):
     outcome = write(session, "--no-verify")
     assert outcome.code == 0, outcome.err
     assert "were not tried" in " ".join((outcome.out + outcome.err).split())
+    assert "--store`, which tries them." in " ".join(outcome.out.split())
     assert not (session.out / "verification.yaml").exists()
 
 
