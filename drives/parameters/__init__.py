@@ -29,7 +29,7 @@ from drives.parameters.journal import (
 from drives.parameters.journal_file import load_journal, save_journal
 from drives.parameters.outcome import MEMORY_WORDS, DriveOutcome
 from drives.parameters.set_up import check_set_up
-from drives.parameters.store import check_can_store
+from drives.parameters.store import can_store, check_can_store
 from drives.parameters.transaction import Transaction
 from drives.parameters.values import HeldObject, Raw, same
 
@@ -53,6 +53,7 @@ __all__ = [
     "Transaction",
     "Written",
     "back_up",
+    "can_store",
     "changes_back_to",
     "check_can_store",
     "check_disabled",

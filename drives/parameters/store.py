@@ -26,6 +26,11 @@ class StoreRefusedError(DrivesError):
     """The drive says that it has not stored anything: its memory is what it was."""
 
 
+def can_store(drive: ParameterDrive) -> bool:
+    """Whether it is known how a drive stores."""
+    return isinstance(drive.profile.store, Store)
+
+
 def check_can_store(drive: ParameterDrive) -> None:
     """Refuse a drive of which it is not known how it stores.
 
@@ -34,7 +39,7 @@ def check_can_store(drive: ParameterDrive) -> None:
     NotSupportedError
         Naming axis and profile; nothing was written.
     """
-    if not isinstance(drive.profile.store, Store):
+    if not can_store(drive):
         raise NotSupportedError(
             f"{drive.axis}: profile {drive.profile.name} does not say how this drive stores its "
             "parameters; nothing was written."

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from drives.canopen_drive.group import profile_of
 from drives.objects import ObjectAddress
-from drives.parameters import Change, Raw
+from drives.parameters import Change, Raw, can_store
 from drives.profile import MachineProfile, load_machine
 from fieldtool.errors import PlanRefusedError
 from fieldtool.workflow.session import Options, Screen, never, open_session, parameter_table
@@ -137,7 +137,7 @@ def switch_tool(
             session.screen.say,
             stop_requested=stop_requested,
         )
-        if tool.verified:
+        if tool.verified and all(can_store(drive) for drive in group.drives):
             result = replace(result, to_store="the same command with --store")
         session.write_back = result
         session.folder.note("parameters", rows=parameter_table(result))

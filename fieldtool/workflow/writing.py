@@ -14,7 +14,7 @@ from drives.errors import (
     StoppedError,
     UserStopError,
 )
-from drives.parameters import Change, load_journal
+from drives.parameters import Change, can_store, load_journal
 from drives.parameters.journal import State
 from fieldtool.design.tuning import Tuning, why_not_stored
 from fieldtool.errors import OutputError, PlanRefusedError
@@ -105,7 +105,8 @@ def written(
                 f"CAREFUL, the new parameters are for a trial only: {verification.not_stored}."
             )
     changes = changes_for(group.drives, tuning)
-    again = _again(session, store=not never)
+    storable = not never and all(can_store(drive) for drive in group.drives)
+    again = _again(session, store=storable)
     if written_since(session.folder.journal) and not any(change.differs for change in changes):
         raise PlanRefusedError(
             "the drives hold these parameters already, since a write of this session, so that a trial "
@@ -145,7 +146,7 @@ def written(
                 verification.ended(error, _held_after(session))
         raise
     with uninterrupted():  # a stop waits until it stands in the folder what the drives hold
-        if not never:
+        if storable:
             more = " once more" if verification is not None else ""
             result = replace(result, to_store=f"{again}, which tries them{more}")
         session.write_back = result

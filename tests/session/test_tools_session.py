@@ -80,6 +80,25 @@ def test_a_set_that_stood_its_trial_says_so_and_may_be_stored(session, tmp_path)
     for node in session.machine.nodes:
         node.power_cycle()
     assert "0x2010:02" in session.changed()[TABLE]
+    assert session.command("restore", tmp_path / "one", "--store").code == 0
+    drive = yaml.safe_load((PACKAGED / "reference.yaml").read_text())
+    give_drives(session, drive | {"store": "unknown"})
+    kept = tools(session, "switch", "gripper", "--yes", "--out", tmp_path / "two")
+    assert kept.code == 0, kept.err
+    assert "working memory only" in " ".join(kept.out.split())
+    assert "--store" not in kept.out
+
+
+PACKAGED = files("profiles") / "drives"
+
+
+def give_drives(session, profile):
+    """Have all drives of the machine's profile described by this one."""
+    (session.folder / "reference.eds").write_bytes((PACKAGED / "reference.eds").read_bytes())
+    (session.folder / "own.yaml").write_text(yaml.safe_dump(profile, sort_keys=False))
+    for axis in session.data["axes"]:
+        axis["drive"] = "own.yaml"
+    session.rewrite(session.data)
 
 
 @pytest.mark.usefixtures("untried")
@@ -364,9 +383,7 @@ def test_a_switch_writes_nothing_that_the_drive_profile_forbids(session, tmp_pat
     tools(session, "keep", "bare")
     session.command("write", session.out, "--yes")
     written = session.changed()
-    packaged = files("profiles") / "drives"
-    drive = yaml.safe_load((packaged / "reference.yaml").read_text())
-    (session.folder / "reference.eds").write_bytes((packaged / "reference.eds").read_bytes())
+    drive = yaml.safe_load((PACKAGED / "reference.yaml").read_text())
     one = drive["parameters"]["velocity_p"]
     if how == "unknown state":
         one["write"] = "unknown"
@@ -374,10 +391,7 @@ def test_a_switch_writes_nothing_that_the_drive_profile_forbids(session, tmp_pat
         drive["gains_via"] = "read-only"
     else:
         one["minimum"] = 1.9
-    (session.folder / "own.yaml").write_text(yaml.safe_dump(drive, sort_keys=False))
-    for axis in session.data["axes"]:
-        axis["drive"] = "own.yaml"
-    session.rewrite(session.data)
+    give_drives(session, drive)
     outcome = tools(session, "switch", "bare", "--yes", "--out", tmp_path / "one")
     assert outcome.code == 3, outcome.err
     assert "Nothing was written" in outcome.err

@@ -221,15 +221,21 @@ def heard(session):
 @pytest.fixture
 def restarting(session):
     """The same, with drives that show only after a restart what they have stored."""
+    other_drives(session, "verify: answer", "verify: read-back after restart")
+    return session
+
+
+def other_drives(session, line, other):
+    """Give the session drives of the reference's profile with one line changed."""
     shipped = files("profiles").joinpath("drives")
     text = shipped.joinpath("reference.yaml").read_text(encoding="utf-8")
-    text = text.replace("verify: answer", "verify: read-back after restart")
+    assert line in text
+    text = text.replace(line, other)
     text = text.replace("eds: reference.eds", f"eds: {shipped.joinpath('reference.eds')}")
-    own = session.out.parent / "restarting.yaml"
+    own = session.out.parent / "own.yaml"
     own.write_text(text, encoding="utf-8")
     machine = session.out / "machine.yaml"
     machine.write_text(machine.read_text().replace("drive: reference", f"drive: {own}"))
-    return session
 
 
 def test_a_drive_that_tells_only_after_a_restart_is_restarted_and_read_back(restarting):
@@ -242,6 +248,23 @@ def test_a_drive_that_tells_only_after_a_restart_is_restarted_and_read_back(rest
     assert held(restarting, TABLE) == held(restarting, ARM) == NEW_RAW
     for node in (table, arm):
         assert node.memory.stored[VELOCITY_P] == NEW_RAW[VELOCITY_P]
+
+
+STORE = (
+    'store: {object: "0x1010:01", timeout: 5 s, verify: answer, restart: false, states: disabled}'
+)
+
+
+def test_where_a_drive_is_not_known_to_store_no_command_is_said_to_keep_what_was_written(session):
+    other_drives(session, STORE, "store: unknown")
+    kept = write(session)
+    assert kept.code == 0, kept.err
+    assert "working memory only" in " ".join(kept.out.split())
+    assert "--store" not in kept.out
+    again = write(session)
+    assert again.code == 3, again.err
+    assert "fieldtool restore" in again.err
+    assert "--store" not in again.err
 
 
 def test_a_drive_that_says_it_has_stored_and_has_not_takes_the_others_back(restarting):
