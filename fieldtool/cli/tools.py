@@ -18,6 +18,7 @@ from fieldtool.cli.stop_key import stop_key
 from fieldtool.errors import noting
 from fieldtool.workflow.tools import Difference
 from fieldtool.writeback.tool_sets import ToolSet
+from fieldtool.writeback.transaction import WriteBack
 
 tools_app = typer.Typer(
     no_args_is_help=True,
@@ -137,10 +138,18 @@ def switch(
     with noting(result.way_back):
         show_parameters(console, result, listed=ask.refused)
         if result.in_memory:
-            console.print(indented(f"`fieldtool restore {result.backup}` takes it back."))
+            console.print(indented(_taken_back(result)))
         if as_json:
             print_json(written_as_dict(folder, result))
     ask.end()
+
+
+def _taken_back(result: WriteBack) -> str:
+    """Say what takes a switch back."""
+    if not result.differs:
+        return "The drives held these values before: only a backup from before they did takes them back."
+    stored = " --store" if result.stored else ""
+    return f"`fieldtool restore {result.backup}{stored}` takes it back."
 
 
 def _tools_table(tools: Sequence[ToolSet]) -> Sheet:

@@ -138,7 +138,8 @@ def switch_tool(
             stop_requested=stop_requested,
         )
         if tool.verified and all(can_store(drive) for drive in group.drives):
-            result = replace(result, to_store="the same command with --store")
+            back = f"`fieldtool restore {result.backup}`, then " if result.differs else ""
+            result = replace(result, to_store=f"{back}the same command with --store")
         session.write_back = result
         session.folder.note("parameters", rows=parameter_table(result))
         session.folder.note("tool", name=name, written=result.in_memory, stored=result.stored)

@@ -53,6 +53,11 @@ class WriteBack:
     """What stores the new values that are in working memory; empty where nothing does."""
 
     @property
+    def differs(self) -> bool:
+        """Whether any new value is another one than the drive held before."""
+        return any(change.differs for change in self.changes)
+
+    @property
     def sentence(self) -> str:
         """Where the new values are, for a person."""
         if not self.in_memory:

@@ -1,6 +1,7 @@
 """Tool sets: kept from what was tried, compared, switched by the same all-or-nothing write."""
 
 import json
+import re
 import shutil
 import signal
 from importlib.resources import files
@@ -67,26 +68,44 @@ def test_sets_are_kept_compared_and_switched_there_and_back(session, tmp_path):
     ]
 
 
-def test_a_set_that_stood_its_trial_says_so_and_may_be_stored(session, tmp_path):
+@pytest.mark.parametrize("folder", ["one", "another"])
+def test_a_set_that_stood_its_trial_says_so_and_may_be_stored(session, tmp_path, folder):
     assert session.command("write", session.out, "--yes").code == 0
     kept = tools(session, "keep", "gripper", "--from", session.out, "--json")
     assert json.loads(kept.out)["verified"] is True
     assert json.loads(kept.out)["figures"]["table"]["sensitivity_peak"] < 2.1
     assert session.command("restore", session.out).code == 0
     switched = tools(session, "switch", "gripper", "--yes", "--out", tmp_path / "one")
-    assert "To keep them: the same command with --store." in " ".join(switched.out.split())
-    stored = tools(session, "switch", "gripper", "--yes", "--store", "--out", tmp_path / "one")
+    named = re.search(
+        r"To keep them: `fieldtool (restore [^`]*)`, then the same command with --store\.",
+        " ".join(switched.out.split()),
+    )
+    assert named is not None, switched.out
+    assert session.command(*named[1].split()).code == 0
+    assert session.changed() == {}
+    stored = tools(session, "switch", "gripper", "--yes", "--store", "--out", tmp_path / folder)
     assert stored.code == 0, stored.err
-    for node in session.machine.nodes:
-        node.power_cycle()
-    assert "0x2010:02" in session.changed()[TABLE]
-    assert session.command("restore", tmp_path / "one", "--store").code == 0
+    power_cycle(session)
+    new = session.changed()
+    assert "0x2010:02" in new[TABLE]
+    itself = tools(session, "switch", "gripper", "--yes", "--out", tmp_path / "same")
+    assert "The drives held these values before" in " ".join(itself.out.split())
+    assert "fieldtool restore" not in itself.out
+    back = re.search(r"`fieldtool (restore [^`]*)` takes it back", " ".join(stored.out.split()))
+    assert session.command(*back[1].split()).code == 0
+    power_cycle(session)
+    assert session.changed() == {}
     drive = yaml.safe_load((PACKAGED / "reference.yaml").read_text())
     give_drives(session, drive | {"store": "unknown"})
-    kept = tools(session, "switch", "gripper", "--yes", "--out", tmp_path / "two")
+    kept = tools(session, "switch", "gripper", "--yes", "--out", tmp_path / "unknown")
     assert kept.code == 0, kept.err
     assert "working memory only" in " ".join(kept.out.split())
     assert "--store" not in kept.out
+
+
+def power_cycle(session):
+    for node in session.machine.nodes:
+        node.power_cycle()
 
 
 PACKAGED = files("profiles") / "drives"
