@@ -106,7 +106,7 @@ def _state(material: Material) -> str:
         return "Written into the drives, read back, and stored in their non-volatile memory."
     return (
         "Written into the drives' working memory and read back; not stored: a power cycle brings "
-        "the old ones back."
+        "back what was stored."
     )
 
 

@@ -66,8 +66,8 @@ class WriteBack:
             return "The new parameters are in the drives and stored: they survive a power cycle."
         keep = f" To keep them: {self.to_store}." if self.to_store else ""
         return (
-            "The new parameters are in the drives' working memory only: a power cycle brings the old "
-            f"ones back.{keep}"
+            "The new parameters are in the drives' working memory only: a power cycle brings back what "
+            f"was stored.{keep}"
         )
 
     @property

@@ -148,9 +148,21 @@ def test_written_parameters_are_read_back(session):
 
 
 def test_what_was_not_stored_is_gone_after_a_power_cycle_as_the_tool_said(session):
-    assert "a power cycle brings the old ones back" in " ".join(write(session).out.split())
+    assert "a power cycle brings back what was stored" in " ".join(write(session).out.split())
     power_cycle(session)
     assert held(session, TABLE) == old(session, TABLE)
+
+
+def test_what_a_power_cycle_brings_after_an_earlier_store_is_what_the_tool_said(session):
+    write(session, "--store")
+    assert session.command("restore", session.out).code == 0
+    outcome = write(session, "--no-verify")
+    session.command("report", session.out)
+    power_cycle(session)
+    assert held(session, TABLE) == NEW_RAW
+    page = re.sub(r"<[^>]*>", " ", (session.out / "report.html").read_text(encoding="utf-8"))
+    for said in (outcome.out, page):
+        assert "a power cycle brings back what was stored" in " ".join(said.split())
 
 
 def test_what_was_stored_survives_a_power_cycle_as_the_tool_said(session):
