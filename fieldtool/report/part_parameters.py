@@ -5,9 +5,9 @@ from math import isclose
 from typing import Any
 
 from fieldtool.design.tuning import Tuning
+from fieldtool.report.in_drives import state
 from fieldtool.report.material import Material
 from fieldtool.report.section import Block, Section, Table, Words
-from fieldtool.writeback.earlier import FIRST_BACKUP
 
 ROUNDED = 1e-2
 """Relative difference that comes of what drives can hold."""
@@ -56,7 +56,7 @@ def parameters(material: Material) -> Section | None:
     )
     if material.tuning.notes:
         blocks.append(Words(tuple(material.tuning.notes), "list"))
-    return Section("Controller parameters", _state(material), tuple(blocks))
+    return Section("Controller parameters", state(material), tuple(blocks))
 
 
 def _rows(material: Material) -> list[Mapping[str, Any]]:
@@ -84,30 +84,6 @@ def _designed_since(tuning: Tuning, rows: Sequence[Mapping[str, Any]]) -> bool:
             ):
                 return True
     return False
-
-
-def _state(material: Material) -> str:
-    written = [event for event in material.events_of("write") if event.get("written")]
-    if not material.events:
-        return "Designed; whether they were written is not known: there is no log."
-    if not written:
-        return "Designed; nothing was written into the drives."
-    last = [e for e in material.events if e in written or e.get("event") == "restored"][-1]
-    if last.get("event") == "restored":
-        without = last.get("without")
-        but = ", ".join(map(str, without)) if isinstance(without, list) else ""
-        backup = last.get("backup", FIRST_BACKUP)
-        old = "the old ones were" if backup == FIRST_BACKUP else f"what {backup} holds was"
-        return (
-            f"Written into the drives and read back; afterwards {old} brought back "
-            f"(`fieldtool restore`){f', but for {but}' if but else ''}."
-        )
-    if written[-1].get("stored"):
-        return "Written into the drives, read back, and stored in their non-volatile memory."
-    return (
-        "Written into the drives' working memory and read back; not stored: a power cycle brings "
-        "back what was stored."
-    )
 
 
 def _row(row: Mapping[str, Any]) -> tuple[str, ...]:

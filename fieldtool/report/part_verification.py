@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from fieldtool.report.figures import layout, log_ticks, numbers
+from fieldtool.report.in_drives import trial_sentence
 from fieldtool.report.material import Material
 from fieldtool.report.section import Block, Plot, Plots, Section, Table, Words
 from fieldtool.report.trial_file import AxisTrial, Figures, Values
@@ -49,7 +50,7 @@ def verification(material: Material) -> Section | None:
         blocks.append(Plots(tuple(plots)))
     if trial.notes:
         blocks.append(Words(tuple(trial.notes), "list"))
-    return Section("Before and after", trial.sentence, tuple(blocks))
+    return Section("Before and after", trial_sentence(material), tuple(blocks))
 
 
 def _cell(figures: Figures | None, name: str) -> str:

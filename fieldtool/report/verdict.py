@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 from fieldtool.criticise.criticism import Base, Criticism, Judged
+from fieldtool.report.in_drives import trial_sentence
 from fieldtool.report.material import Material
 from fieldtool.report.words import cause_words, listed, percent
 
@@ -47,8 +48,8 @@ def _of_data(criticism: Criticism, data: Base) -> list[str]:
 def verdict(material: Material) -> tuple[str, str]:
     """Return one plain sentence, and its tone: good, mixed or open."""
     if material.criticism is not None:
-        tried = f" {material.trial.sentence}" if material.trial is not None else ""
-        return f"{_of(material.criticism)}{tried}", TONES[material.criticism.verdict]
+        said = f"{_of(material.criticism)} {trial_sentence(material)}".rstrip()
+        return said, TONES[material.criticism.verdict]
     stopped = _stopped(material)
     if material.model is not None:
         return f"The machine was identified; its simulation was not criticised.{stopped}", "open"

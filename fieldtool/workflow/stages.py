@@ -332,7 +332,10 @@ def restore(
     folder = SessionFolder(source.backup_path.parent)
     if backup.is_dir() or folder.events.is_file():  # a file may lie anywhere
         name = source.backup_path.name
-        folder.note("restored", stored=store, without=sorted(without), backup=name)
+        memory = {one.axis: one.memory.value for one in restored.outcomes}
+        folder.note(
+            "restored", stored=restored.stored, memory=memory, without=sorted(without), backup=name
+        )
     return restored
 
 

@@ -615,6 +615,26 @@ def test_the_report_knows_of_a_restore_from_a_file_of_the_session(session, name,
     assert said in text
 
 
+def test_the_report_says_what_a_power_cycle_brings_after_a_restore(session):
+    def lead(*options):
+        assert session.command("restore", session.out, *options).code == 0
+        assert session.command("report", session.out).code == 0
+        html = (session.out / "report.html").read_text(encoding="utf-8")
+        return re.sub(r"<[^>]*>|\s+", " ", html)
+
+    assert write(session).code == 0
+    not_stored = lead()
+    assert "a power cycle brings back what was stored" in not_stored
+    assert "holds new parameters" not in not_stored
+    assert write(session, "--store").code == 0
+    in_memory = lead()
+    assert "In table and arm it is in working memory only" in in_memory
+    assert "The non-volatile memory of table and arm holds new parameters." in in_memory
+    assert "Their non-volatile memory holds it too." in lead("--store")
+    power_cycle(session)
+    assert session.changed() == {}
+
+
 def unproven(_):
     raise NotVerifiedError("the new parameters do not stand their trial: test")
 

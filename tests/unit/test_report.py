@@ -478,6 +478,23 @@ def test_what_was_written_is_told_from_what_was_designed_or_tried_later():
     assert "nothing was written" in section.lead
 
 
+def test_a_trial_that_was_stood_is_said_to_be_taken_back_since():
+    sentence = "The new parameters stood their trial on the machine."
+    trial = TrialFile(format="fieldtool-verification/1", sentence=sentence, axes=[])
+    stood = [{"event": "verified", "verdict": "verified"}, {"event": "write", "written": True}]
+    back = {"event": "restored", "stored": False, "backup": "parameters-before.yaml"}
+
+    def lead(*events):
+        return verification(Material("s", trial=trial, events=events)).lead
+
+    assert lead(*stood) == lead(back, *stood) == lead() == sentence
+    assert lead(*stood, back) == (
+        f"{sentence} Since then the old ones were brought back (`fieldtool restore`)."
+    )
+    failed = {"event": "verified", "verdict": "restored"}
+    assert lead(failed, back) == sentence, "which says it"
+
+
 @pytest.mark.parametrize("log", [b"\xff\x00 no log\n", b"[1]\n", b"{\n" * 9, None])
 def test_a_log_that_tells_nothing_is_said_and_nothing_is_claimed_from_it(session, tmp_path, log):
     folder, _ = session
