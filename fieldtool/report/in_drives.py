@@ -1,7 +1,9 @@
-"""What has become of new parameters in the drives, by a session's log."""
+"""What has become of new parameters in the drives, by a session's log and write journal."""
 
 from collections.abc import Mapping
 
+from drives.parameters import Journal
+from drives.parameters.journal import State
 from fieldtool.report.material import Event, Material
 from fieldtool.report.words import listed
 from fieldtool.writeback.earlier import FIRST_BACKUP
@@ -9,22 +11,55 @@ from fieldtool.writeback.earlier import FIRST_BACKUP
 
 def state(material: Material) -> str:
     """Say whether new parameters were written, stored, or taken back, and what a power cycle brings."""
-    written = [event for event in material.events_of("write") if event.get("written")]
     if not material.events:
         return "Designed; whether they were written is not known: there is no log."
-    if not written:
-        return "Designed; nothing was written into the drives."
-    last = [e for e in material.events if e in written or e.get("event") == "restored"][-1]
-    if last.get("event") == "restored":
+    journal = material.journal if material.journal and material.journal.writes else None
+    done = [event for event in material.events if _changes(event)]
+    last = done[-1] if done else {}
+    if _unknown(journal, last):
         return (
-            f"Written into the drives and read back; afterwards {_restored(last)}.{_brings(last)}"
+            "A write into the drives has not ended, or was not taken back in all of them: what they "
+            "hold is not known. `fieldtool restore` with the session's folder brings the old ones back."
         )
+    written = [event for event in done if event.get("event") == "write"]
+    if not (journal or written or "verified" in {event.get("event") for event in done}):
+        return "Designed; nothing was written into the drives."
+    kept = [event for event in done if event.get("event") != "verified"]
+    later = " What was written later was taken back." if last.get("event") == "verified" else ""
+    if last.get("event") == "restored" or (written and kept[-1].get("event") == "restored"):
+        begun = "and read back" if written else "in whole or in part"
+        back = kept[-1]
+        return (
+            f"Written into the drives {begun}; afterwards {_restored(back)}.{_brings(back)}{later}"
+        )
+    if not written:
+        if journal and journal.state is State.NEW:
+            return "Written into the drives and read back; the log does not say whether they are stored."
+        return "Written into the drives and taken back: the drives hold what they held before."
     if written[-1].get("stored"):
-        return "Written into the drives, read back, and stored in their non-volatile memory."
+        return (
+            f"Written into the drives, read back, and stored in their non-volatile memory.{later}"
+        )
     return (
         "Written into the drives' working memory and read back; not stored: a power cycle brings "
-        "back what was stored."
+        f"back what was stored.{later}"
     )
+
+
+def _unknown(journal: Journal | None, last: Event) -> bool:
+    """Whether a write was cut off, or drives could not be taken back; a later restore is no such end."""
+    if last.get("event") == "restored":
+        restored = str(last.get("time"))
+        return journal is not None and journal.is_open and journal.begun[:19] > restored[:19]
+    return last.get("verdict") == "mixed" or (journal is not None and journal.is_open)
+
+
+def _changes(event: Event) -> bool:
+    """Whether an event tells of new or old parameters in the drives."""
+    kind = event.get("event")
+    if kind == "verified":  # one that was stood is followed by its write
+        return event.get("verdict") in ("restored", "mixed")
+    return kind == "restored" or (kind == "write" and bool(event.get("written")))
 
 
 def trial_sentence(material: Material) -> str:

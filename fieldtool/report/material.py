@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Any
 
+from drives.parameters import Journal
 from drives.profile import MachineProfile
 from fieldtool.criticise.criticism import Criticism
 from fieldtool.criticise.pictures_file import Picture
@@ -41,6 +42,8 @@ class Material:
     tuning: Tuning | None = None
     trial: TrialFile | None = None
     """What the trial of new parameters showed."""
+    journal: Journal | None = None
+    """Of the last write into the drives."""
     events: tuple[Event, ...] = ()
     missing: tuple[str, ...] = ()
     """One sentence for each thing that is not there, or can not be read."""

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from drives.errors import DrivesError, ProfileError, UserStopError
+from drives.parameters import load_journal
 from drives.profile import MachineProfile, load_machine
 from fieldtool.criticise.criticise import Criticised
 from fieldtool.criticise.criticism_file import read_criticism
@@ -140,6 +141,7 @@ def material_of(folder: SessionFolder) -> Material:
             "no controller was designed: `fieldtool design` on this folder.",
         ),
         trial=read(folder.verification, read_trial, ""),
+        journal=read(folder.journal, load_journal, ""),
         events=events,
         missing=tuple(missing),
     )

@@ -615,6 +615,15 @@ def test_the_report_knows_of_a_restore_from_a_file_of_the_session(session, name,
     assert said in text
 
 
+def test_a_report_after_a_write_that_was_taken_back_says_so(session):
+    session.machine.node(ARM).dictionary.guards[VELOCITY_I] = lambda _: 0x08000022
+    assert write(session, "--no-verify").code == 6
+    assert session.command("report", session.out).code == 0
+    html = (session.out / "report.html").read_text(encoding="utf-8")
+    assert "Written into the drives and taken back: the drives hold what they held before." in html
+    assert "nothing was written" not in html
+
+
 def test_the_report_says_what_a_power_cycle_brings_after_a_restore(session):
     def lead(*options):
         assert session.command("restore", session.out, *options).code == 0

@@ -16,6 +16,9 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from drives.objects import ObjectAddress, ObjectInfo
+from drives.parameters import DriveRecord, Journal, JournalEntry, Storing
+from drives.parameters.journal import State
 from fieldtool.cli.main import main
 from fieldtool.criticise.criticise import criticise
 from fieldtool.criticise.criticism_file import read_criticism
@@ -476,6 +479,57 @@ def test_what_was_written_is_told_from_what_was_designed_or_tried_later():
     table, _ = section.blocks
     assert table.rows[0][3] == "4.2"
     assert "nothing was written" in section.lead
+
+
+def journal(state, begun="2026-01-02T03:04:05+00:00"):
+    info = ObjectInfo(ObjectAddress(0x2010, 2), "UNSIGNED32", "gain")
+    entries = (JournalEntry(info, 1, 2),)
+    drive = DriveRecord("table", 11, 0, 0, 0, 0, entries)
+    return Journal("m", begun, "parameters-before.yaml", Storing.NONE, (drive,), state=state)
+
+
+WROTE = {"event": "write", "written": True, "stored": True}
+RESTORED = {"event": "restored", "stored": True, "time": "2026-01-02T03:04:09.123+00:00"}
+TAKEN_BACK = "Written into the drives and taken back: the drives hold what they held before."
+
+
+@pytest.mark.parametrize(
+    ("events", "held", "said"),
+    [
+        ([], None, "Designed; nothing was written into the drives."),
+        (["restored"], None, TAKEN_BACK),
+        ([], State.OLD, TAKEN_BACK),
+        ([WROTE, "restored"], State.OLD, "What was written later was taken back."),
+        ([WROTE, RESTORED, "restored"], State.OLD, "What was written later was taken back."),
+        (["mixed"], None, "what they hold is not known"),
+        (["mixed", RESTORED], State.OLD, "afterwards the old ones were brought back"),
+        ([WROTE], State.OPEN, "what they hold is not known"),
+        ([WROTE, RESTORED], State.OPEN, "afterwards the old ones were brought back"),
+        ([RESTORED], State.OLD, "Written into the drives in whole or in part; afterwards"),
+        ([], State.NEW, "does not say whether they are stored"),
+        (["verified", WROTE], State.NEW, "stored in their non-volatile memory."),
+    ],
+)
+def test_what_was_written_and_taken_back_is_never_called_not_written(events, held, said):
+    verdicts = [
+        {"event": "verified", "verdict": one} if isinstance(one, str) else one for one in events
+    ]
+    tuning = Tuning((AxisTuning("table", {"velocity_p": 4.2}, 1.5, "why"),))
+    material = Material(
+        "x",
+        tuning=tuning,
+        events=({"event": "session"}, *verdicts),
+        journal=None if held is None else journal(held),
+    )
+    assert said in parameters(material).lead
+
+
+def test_a_write_that_was_cut_off_after_a_restore_is_not_called_brought_back():
+    events = ({"event": "session"}, WROTE, RESTORED)
+    tuning = Tuning((AxisTuning("table", {"velocity_p": 4.2}, 1.5, "why"),))
+    since = journal(State.OPEN, "2026-01-02T03:05:00+00:00")
+    material = Material("x", tuning=tuning, events=events, journal=since)
+    assert "what they hold is not known" in parameters(material).lead
 
 
 def test_a_trial_that_was_stood_is_said_to_be_taken_back_since():
