@@ -42,6 +42,7 @@ __all__ = [
     "RecordingWriter",
     "Segment",
     "experiment_fault",
+    "experiment_names",
     "grid_fault",
     "load",
     "save",
@@ -153,6 +154,18 @@ def recorded_seconds(path: Path) -> float:
         if not 0.0 <= seconds < inf:
             raise reader.fault(f"{rows} rows of one 'sample_period' are {seconds} s.")
         return seconds
+
+
+def experiment_names(path: Path) -> tuple[str, ...]:
+    """Return the names of the experiments; no signal is read.
+
+    Raises
+    ------
+    FileFormatError
+        As :func:`load`.
+    """
+    with opened(path, FORMAT) as reader:
+        return tuple(one.text("name") for one in reader.child("experiments").children())
 
 
 def whole_kinds(path: Path) -> set[str]:

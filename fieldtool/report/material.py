@@ -33,6 +33,8 @@ class Material:
     recording: Recording | None = None
     trial_seconds: float = 0.0
     """Seconds in which new parameters were tried, old ones beside them; not in the recording."""
+    trial_experiments: tuple[str, ...] = ()
+    """Their names, which begin with ``before`` (old parameters) or ``after`` (new ones)."""
     responses: Mapping[str, FrequencyResponse] = field(default_factory=dict)
     band: ModelBand | None = None
     """How well the identified model's response is known."""
@@ -64,6 +66,14 @@ class Material:
     def events_of(self, kind: str) -> tuple[Event, ...]:
         """Return the events of one kind, in order."""
         return tuple(e for e in self.events if e.get("event") == kind)
+
+    @property
+    def ended(self) -> Event | None:
+        """How the last command ended, where that was not as it should; None otherwise."""
+        begun = [k for k, event in enumerate(self.events) if event.get("event") == "session"]
+        last = self.events[begun[-1] :] if begun else self.events
+        ends = [event for event in last if event.get("event") == "ended" and event.get("text")]
+        return ends[-1] if ends else None
 
     @property
     def begun(self) -> datetime | None:

@@ -1,5 +1,6 @@
 """What was done and when, what is missing, warnings, and the log."""
 
+import re
 from collections.abc import Mapping
 from datetime import datetime
 from typing import Any
@@ -44,10 +45,17 @@ def facts(material: Material) -> tuple[tuple[str, str], ...]:
     if material.recording is not None:
         out.append(("Measured", _measured(material.recording)))
     if material.trial_seconds:
-        out.append(
-            ("Tried", f"old and new parameters, {material.trial_seconds:.3g} s of machine time")
-        )
+        tried = f"{_tried(material)}, {material.trial_seconds:.3g} s of machine time"
+        out.append(("Tried", tried))
     return tuple(out)
+
+
+def _tried(material: Material) -> str:
+    """Say which parameters moved the axes in trials; what a kill cut off may be of either."""
+    kinds = {re.split("[:,]", name)[0] for name in material.trial_experiments}
+    if "after" in kinds:
+        return "old and new parameters"
+    return "old parameters" if kinds == {"before"} else "parameters"
 
 
 def _measured(recording: Recording) -> str:
@@ -62,26 +70,28 @@ def _measured(recording: Recording) -> str:
 
 
 def missing(material: Material) -> Section | None:
-    """Say what is not there, and why, where a session did not come to its end."""
-    ended = material.events_of("ended")
-    words = [str(ended[-1]["text"])] if ended and ended[-1].get("text") else []
-    if not words and not material.missing:
+    """Say what is not there, and how a session ended that did not come to its end."""
+    ended = material.ended
+    if ended is None and not material.missing:
         return None
     return Section(
-        "What is missing",
-        _cut_short(material) if words else "Not everything is there.",
-        (*([Words(tuple(words), "warning")] if words else []), Words(material.missing, "list")),
+        "What is missing" if material.missing else "How it ended",
+        "Not everything is there." if ended is None else _cut_short(material, ended),
+        (
+            *([] if ended is None else [Words((str(ended["text"]),), "warning")]),
+            Words(material.missing, "list"),
+        ),
     )
 
 
-def _cut_short(material: Material) -> str:
+def _cut_short(material: Material, ended: Event) -> str:
     begun = material.events_of("session")
-    if len(begun) < 2:
-        return "This session did not come to its end."
-    return (
-        f"The session's last command, {begun[-1].get('command')} of {_clock(begun[-1])}, did not come "
-        "to its end; what is shown is from those before."
-    )
+    who = "This session"
+    if len(begun) > 1:
+        who = f"The session's last command, {begun[-1].get('command')} of {_clock(begun[-1])},"
+    if ended.get("error") == "WriteBackError":
+        return f"{who} took the new parameters back."
+    return f"{who} did not come to its end."
 
 
 def done(material: Material) -> Section | None:

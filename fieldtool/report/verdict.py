@@ -117,7 +117,10 @@ def _not_unseen(criticism: Criticism) -> str:
 
 
 def _stopped(material: Material) -> str:
-    ended = material.events_of("ended")
-    if ended and ended[-1].get("text"):
-        return f" The session ended early: {ended[-1]['text']}"
-    return ""
+    ended = material.ended
+    if ended is None:
+        return ""
+    early = (
+        "" if ended.get("error") == "WriteBackError" else " early"
+    )  # all was done, and taken back
+    return f" The session ended{early}: {ended['text']}"

@@ -18,7 +18,7 @@ from fieldtool.frf.response import load_band, load_responses
 from fieldtool.records.files import read_text
 from fieldtool.records.model import MachineModel
 from fieldtool.records.model_file import read_model
-from fieldtool.records.recording import Recording, load, recorded_seconds
+from fieldtool.records.recording import Recording, experiment_names, load, recorded_seconds
 from fieldtool.records.session_folder import SessionFolder
 from fieldtool.report.contents import page_of
 from fieldtool.report.material import Material
@@ -122,6 +122,7 @@ def material_of(folder: SessionFolder) -> Material:
             lambda path: read_criticism(path, known),
             "its simulation was not criticised: `fieldtool criticise` on this folder.",
         )
+    trials = [found for path in folder.trials if (found := read(path, _trial, ""))]
     return Material(
         name=folder.path.resolve().name,
         machine=machine,
@@ -129,7 +130,8 @@ def material_of(folder: SessionFolder) -> Material:
         prior=_prior(machine),
         truth=truth_model(machine) if machine else None,
         recording=recording,
-        trial_seconds=sum(read(path, recorded_seconds, "") or 0.0 for path in folder.trials),
+        trial_seconds=sum(seconds for seconds, _ in trials),
+        trial_experiments=tuple(name for _, names in trials for name in names),
         responses=responses or {},
         band=read(folder.frequency_response, load_band, "") if responses else None,
         model=model,
@@ -145,6 +147,11 @@ def material_of(folder: SessionFolder) -> Material:
         events=events,
         missing=tuple(missing),
     )
+
+
+def _trial(path: Path) -> tuple[float, tuple[str, ...]]:
+    """Return a trial's seconds, and the names of its experiments."""
+    return recorded_seconds(path), experiment_names(path)
 
 
 def _prior(machine: MachineProfile | None) -> MachineModel | None:

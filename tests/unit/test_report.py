@@ -35,11 +35,13 @@ from fieldtool.report.contents import page_of
 from fieldtool.report.figures import log_ticks
 from fieldtool.report.material import Material
 from fieldtool.report.page import Page, html_of
+from fieldtool.report.part_done import facts, missing
 from fieldtool.report.part_parameters import parameters
 from fieldtool.report.part_verification import verification
 from fieldtool.report.part_wrong import wrong
 from fieldtool.report.section import Plot, Section, Table, Words
 from fieldtool.report.trial_file import AxisTrial, Figures, TrialFile
+from fieldtool.report.verdict import verdict
 from fieldtool.workflow.reporting import material_of, report
 from tests.fuzzed import changed, places
 from tests.unit.late_axis import FINE, MODEL, STEP, recorded
@@ -304,6 +306,7 @@ def test_a_damaged_recording_of_a_trial_is_named(session, tmp_path, content):
     (part / "verification-2.h5").write_bytes(content)
     material = material_of(SessionFolder(part))
     assert material.trial_seconds == seconds
+    assert material.trial_experiments == tuple(e.name for e in material.recording.experiments)
     assert any("verification-2.h5 can not be read" in sentence for sentence in material.missing)
     assert report(part).is_file()
 
@@ -373,6 +376,40 @@ def test_a_stopped_session_says_how_it_ended(session, tmp_path):
     html = report(part).read_text(encoding="utf-8")
     assert "did not come to its end" in html
     assert "The machine was measured; it was not identified." in html
+
+
+def test_how_the_last_command_ended_is_said_of_it_alone():
+    first = {"event": "session", "command": "run"}
+    second = {"event": "session", "command": "write"}
+    stopped = {"event": "ended", "error": "UserStopError", "text": "stopped by the user"}
+    failed = {"event": "ended", "error": "WriteBackError", "text": "do not stand their trial"}
+
+    def part(*events):
+        return missing(Material("s", events=events))
+
+    assert part(first, stopped).lead == "This session did not come to its end."
+    again = part(first, stopped, second, stopped)
+    assert again.title == "How it ended", "nothing is missing"
+    assert again.lead.startswith("The session's last command, write of ")
+    assert again.lead.endswith(", did not come to its end."), "whose data are shown is not known"
+    back = part(first, stopped, second, failed)
+    assert back.lead.endswith(", took the new parameters back.")
+    assert back.blocks[0].sentences == ("do not stand their trial",)
+    assert "ended early" not in verdict(Material("s", events=(first, failed)))[0]
+    assert part(first, stopped, second, {"event": "ended"}) is None
+
+
+@pytest.mark.parametrize(
+    ("names", "said"),
+    [
+        (("before: nudge of a", "before, begun again (1): move of a"), "old parameters, 3 s"),
+        (("before: move of a", "after: nudge of a"), "old and new parameters, 3 s"),
+        (("before: move of a", "cut off while the axes moved"), "parameters, 3 s"),
+    ],
+)
+def test_what_was_tried_is_what_moved_the_axes(names, said):
+    shown = dict(facts(Material("s", trial_seconds=3.0, trial_experiments=names)))
+    assert shown["Tried"] == f"{said} of machine time"
 
 
 @pytest.mark.parametrize("kind", ["none", "empty", "file"])
