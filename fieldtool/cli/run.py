@@ -155,9 +155,10 @@ def measure(
             screen=StoppableScreen(screen, key),
             stop_requested=key,
         )
-    console.print(f"{seconds:.0f} s of machine time; the recording is in {folder}")
+    console.print(f"{seconds:.0f} s of excitation; the recording is in {folder}")
     if as_json:
-        print_json({"folder": str(folder), "time": {"machine_s": seconds}})
+        times = {"excitation_s": seconds, "machine_s": seconds}
+        print_json({"folder": str(folder), "time": times})
 
 
 def _show_plan(

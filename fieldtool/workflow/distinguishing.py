@@ -76,7 +76,7 @@ class Distinguished:
             "question": self.question,
             "answer": self.answer,
             "criticism": self.criticism.as_dict(),
-            "time": {"machine_s": self.machine_time},
+            "time": {"excitation_s": self.machine_time, "machine_s": self.machine_time},
         }
 
 

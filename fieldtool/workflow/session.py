@@ -157,10 +157,13 @@ class SessionResult:
             "criticism": self.criticism.as_dict() if self.criticism else None,
             "truth": self.truth.as_dict() if self.truth else None,
             "time": {
-                "machine_s": self.machine_time,
+                "excitation_s": self.machine_time,
+                "machine_s": self.machine_time,  # as it was called before
                 "moving_s": self.moving_time,
                 "wall_s": self.wall_time,
             },
+            "written": self.write_back is not None and self.write_back.in_memory,
+            "stored": self.write_back is not None and self.write_back.stored,
             "parameters": parameter_table(self.write_back),
             "verification": self.verification.as_dict() if self.verification else None,
             "warnings": list(self.warnings),

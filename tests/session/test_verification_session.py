@@ -446,7 +446,9 @@ def test_a_loaded_axis_moves_away_from_the_end_of_its_travel(session):
 def test_a_whole_run_has_the_verification_in_its_json(small_bench):
     outcome = small_bench.run("--json", "--write", "--yes")
     assert outcome.code == 0, outcome.err
-    found = json.loads(outcome.out)["verification"]
+    told = json.loads(outcome.out)
+    assert (told["written"], told["stored"]) == (True, False)
+    found = told["verification"]
     assert found["verdict"] == "verified"
     assert found["axes"][0]["after"]["sensitivity_peak"] < 2.1
 

@@ -244,6 +244,13 @@ def test_a_result_on_the_screen(folder: str) -> None:
     assert "Machine time 13 min 20 s, 12 min 34 s of it excitation; wall time 1 min 02 s." in text(
         out
     )
+    told = result.as_dict()
+    times = {"excitation_s": 754.0, "machine_s": 754.0, "moving_s": 800.0, "wall_s": 61.5}
+    assert told["time"] == times
+    assert (told["written"], told["stored"]) == (False, False)
+    stored = replace(write_back, in_memory=True, stored=True)
+    told = replace(result, write_back=stored).as_dict()
+    assert (told["written"], told["stored"]) == (True, True)
     assert write_back.sentence in text(out)
     with TerminalScreen(console(200)) as screen:
         screen.found(result.model, result.truth)
