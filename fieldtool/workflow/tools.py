@@ -66,7 +66,7 @@ def compare_tools(
 ) -> tuple[ToolSet, ToolSet, tuple[Difference, ...]]:
     """Return two tool sets, and the parameters in which they differ."""
     profile = _profile(machine)
-    a, b = tool_set(profile.name, one), tool_set(profile.name, other)
+    a, b = (tool_set(profile.name, name, profile.path) for name in (one, other))
     names = {
         axis.name: {p.object: n for n, p in profile_of(axis, profile).parameters.items()}
         for axis in profile.axes
@@ -110,7 +110,7 @@ def switch_tool(
         As :func:`fieldtool.writeback.transaction.apply`.
     """
     profile = _profile(machine)
-    tool = tool_set(profile.name, name)
+    tool = tool_set(profile.name, name, profile.path)
     if store and not tool.verified:
         raise PlanRefusedError(
             f"tool set {name} was not tried on the machine, so it is not stored: leave --store away, or "

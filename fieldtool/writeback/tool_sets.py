@@ -108,8 +108,8 @@ def tool_sets(machine: str) -> ToolSets:
     return ToolSets(tuple(whole), bad)
 
 
-def tool_set(machine: str, name: str) -> ToolSet:
-    """Return one tool set.
+def tool_set(machine: str, name: str, profile: Path | str = "MACHINE") -> ToolSet:
+    """Return one tool set; ``profile`` is the machine's file, for what there is to be typed.
 
     Raises
     ------
@@ -125,8 +125,8 @@ def tool_set(machine: str, name: str) -> ToolSet:
         others = [one.name for one in tools_folder(machine).glob("*") if one.is_dir()]
         known = f"there are {', '.join(sorted(others))}" if others else "there is none yet"
         raise NoSuchToolError(
-            f"machine {machine} has no tool set {name!r}; {known}. `fieldtool tools keep {machine} "
-            f"{name}` keeps one."
+            f"machine {machine} has no tool set {name!r}; {known}. `fieldtool tools keep {profile} "
+            f"{name} --from SESSION` keeps what a session has written."
         )
     data = read_tool_file(path, name, machine)
     parameters = load_backup(folder / "parameters.yaml")

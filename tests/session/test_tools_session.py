@@ -172,6 +172,18 @@ def test_wrong_use_is_one_sentence(session, words, code, sentence, monkeypatch, 
 
 
 @pytest.mark.usefixtures("untried")
+@pytest.mark.usefixtures("untried")
+def test_the_command_that_keeps_a_set_that_is_missing_works_as_it_is_told(session, tmp_path):
+    assert session.command("write", session.out, "--yes").code == 0
+    missing = tools(session, "switch", "grip", "--yes")
+    assert missing.code == 2, missing.err
+    told = re.search(r"`fieldtool (tools keep .*) --from SESSION`", " ".join(missing.err.split()))
+    kept = session.command(*told[1].split(), "--from", session.out)
+    assert kept.code == 0, kept.err
+    switched = tools(session, "switch", "grip", "--yes", "--out", tmp_path / "switched")
+    assert switched.code == 0, switched.err
+
+
 def test_a_set_of_other_drives_is_refused(session, make_bench, tmp_path):
     tools(session, "keep", "bare")
     other = make_bench(session.data | {}, serial=9999)
