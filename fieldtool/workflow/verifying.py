@@ -367,6 +367,7 @@ class Verification:
         for one in () if reasons else compared:
             doubtful += strayed(one)
             doubtful += doubts(one, cycle) if self._believed else ()
+        told = (*self._records.notes(compared), *doubtful)
         self.result = Verified(
             "restored" if reasons else "verified",
             reasons,
@@ -375,11 +376,11 @@ class Verification:
             self._bound,
             "identified" if self._believed else "prior",
             cycle,
-            (*self._planned.notes, *self._records.notes(compared), *doubtful),
+            (*self._planned.notes, *told),
             tuple(moves),
         )
         self._session.screen.verified(self.result)
-        for text in doubtful:
+        for text in told:  # what was planned was said then
             self._session.warn(text)
 
     def ended(self, error: BaseException | None, held: State) -> None:

@@ -150,6 +150,19 @@ def test_where_what_was_written_swings_the_way_back_is_named(session, monkeypatc
     assert way_back in " ".join(outcome.err.split())
 
 
+def test_what_a_trial_could_not_see_is_on_the_screen_too(session, monkeypatch):
+    from fieldtool.workflow.trial_records import TrialRecords
+
+    note = "table: dry friction holds it in the small excitation."
+    monkeypatch.setattr(TrialRecords, "notes", lambda *_: (note,))
+    outcome = write(session)
+    assert outcome.code == 0, outcome.err
+    assert note in verification(session)["notes"]
+    _, table, after = outcome.out.partition("sensitivity peak")
+    assert table
+    assert " ".join(after.split()).count(note) == 1
+
+
 def test_dry_friction_in_the_model_is_reckoned_with_in_the_trial(make_bench, profile_of_two):
     """It rules settling, and hides the loop from a small excitation: both are predicted."""
     share = 0.05
