@@ -24,7 +24,10 @@ BANDS = 12.0
 
 
 def draw_verification(
-    axes: Sequence[tuple[Comparison, History, History]], prediction: Prediction, path: Path
+    axes: Sequence[tuple[Comparison, History, History]],
+    prediction: Prediction,
+    bound: float,
+    path: Path,
 ) -> None:
     """Draw move, error at its end, sensitivity, response and step of every axis.
 
@@ -34,6 +37,8 @@ def draw_verification(
         Comparison, and what was measured before and after; None where it was not.
     prediction
         Of the new parameters.
+    bound
+        Peak of sensitivity that they were designed for.
     path
         PNG file to write.
 
@@ -45,11 +50,12 @@ def draw_verification(
     figure = Figure(figsize=(20.0, 3.3 * len(axes) + 0.5), layout="constrained")
     FigureCanvasAgg(figure)
     plots = figure.subplots(len(axes), 5, squeeze=False)
+    asked = f"{bound:g} ({20 * np.log10(bound):.2g} dB)"
     for row, (k, (one, before, after)) in zip(plots, enumerate(axes), strict=True):
         foreseen = foreseen_move(prediction, k)
         _draw_move(row[0], one, before, foreseen, after)
         _draw_error(row[1], one, before, foreseen, after)
-        _draw_by_frequency(row[2], one, "size", "sensitivity", 2.0, "2 (6 dB)")
+        _draw_by_frequency(row[2], one, "size", "sensitivity", bound, asked)
         _draw_by_frequency(row[3], one, "response", "response of the loop", 0.5**0.5, "-3 dB")
         _draw_step(row[4], one)
     for plot in (plots[0, 0], plots[0, 2], plots[0, 3], plots[0, 4]):

@@ -410,7 +410,8 @@ class Verification:
         except OutputError as failed:
             self._session.warn(str(failed))
         try:
-            draw_verification(self._histories, self._planned.after, folder.verification_picture)
+            picture = folder.verification_picture
+            draw_verification(self._histories, self._planned.after, self._bound, picture)
         except Exception as failed:
             self._session.warn(f"{folder.verification_picture}: not drawn ({failed})")
 

@@ -1,12 +1,14 @@
 """The verdict on new parameters: what was not measured never passes for good."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from fieldtool.design.measured import AxisFigures, Sensitivity
 from fieldtool.design.verdict import Comparison, doubts, faults, strayed
+from fieldtool.report import verification_picture
 
 GOOD = AxisFigures(0.1, 0.5, 0.001, 0.01, 0.001, 1.0, 1.5, 10.0)
 FREQUENCY = np.array([5.0, 10.0, 20.0])
@@ -177,3 +179,17 @@ def test_a_peak_that_friction_makes_is_not_asked_of_the_machine() -> None:
     assert "1.7 was wanted" in judged(1.86, 1.6, 1.55, 1.7)[0]
     assert "was wanted" in judged(2.3, 3.2, 1.2, 1.7)[0]  # no loop may have so much
     assert "was wanted" in judged(1.86, 1.4, 1.36, 1.7)[0]
+
+
+def test_the_picture_has_the_bound_that_was_designed_for(monkeypatch, tmp_path):
+    drawn = []
+    monkeypatch.setattr(verification_picture, "save_picture", lambda *of: drawn.append(of[0]))
+    one = Comparison("x", "rad", 1.0, 0.5, 0.01, GOOD, GOOD, GOOD, None, CURVE, CURVE)
+    unstable = SimpleNamespace(axes=[SimpleNamespace(curves=None)])
+    path = tmp_path / "verification.png"
+    verification_picture.draw_verification([(one, None, None)], unstable, 1.4, path)
+    (figure,) = drawn
+    sensitivity = figure.axes[2]
+    levels = {line.get_label(): line.get_ydata()[0] for line in sensitivity.lines}
+    assert levels["1.4 (2.9 dB)"] == 1.4
+    assert "2 (6 dB)" not in levels
