@@ -25,6 +25,11 @@ SHORTEST_WAIT = 1e-4
 """Seconds; a difference of two times may be smaller than a clock can tell."""
 
 
+def is_data(message: can.Message) -> bool:
+    """Whether it is a frame of CANopen's; an error frame's class may equal any identifier."""
+    return not (message.is_error_frame or message.is_remote_frame or message.is_extended_id)
+
+
 class Line(canopen.Network):  # type: ignore[misc]
     """A CANopen network whose frames are received by those who wait for them."""
 
@@ -147,9 +152,7 @@ class Line(canopen.Network):  # type: ignore[misc]
     def pump(self, timeout: float) -> can.Message | None:
         """Receive at most one frame, hand it on to those who subscribed, and return it."""
         message = self.receive(timeout)
-        if message is not None and not (
-            message.is_error_frame or message.is_remote_frame or message.is_extended_id
-        ):
+        if message is not None and is_data(message):
             self.notify(message.arbitration_id, message.data, message.timestamp)
         return message
 
@@ -159,7 +162,7 @@ class Line(canopen.Network):  # type: ignore[misc]
         deadline = self.clock.now() + seconds
         while (left := deadline - self.clock.now()) > 0:
             message = self.pump(max(SHORTEST_WAIT, left))
-            if message is not None and not message.is_extended_id:
+            if message is not None and is_data(message):
                 heard.add(message.arbitration_id)
         return frozenset(heard)
 

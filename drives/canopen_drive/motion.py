@@ -24,7 +24,7 @@ from drives.canopen_drive.channel import (
 from drives.canopen_drive.drive import CanopenDrive
 from drives.canopen_drive.energy import reversed_axis
 from drives.canopen_drive.interrupts import uninterrupted
-from drives.canopen_drive.line import Line
+from drives.canopen_drive.line import Line, is_data
 from drives.canopen_drive.outputs import Outputs, outputs_of
 from drives.canopen_drive.pace import LATE_SHARE, Punctuality
 from drives.canopen_drive.setup import HOST_HEARTBEAT, HOST_LOST_AFTER, HOST_NODE_ID
@@ -549,7 +549,7 @@ class CanopenMotion:
         A drive's PDO among them came too late for its SYNC, or answers a SYNC that is not ours.
         """
         k = self._by_cob.get(message.arbitration_id)
-        if k is not None and not message.is_extended_id:
+        if k is not None and is_data(message):
             self._channels[k].strayed = self._disturbed = True
         else:
             self._hand_on(message)
@@ -568,7 +568,7 @@ class CanopenMotion:
             if message is None:
                 break
             k = by_cob.get(message.arbitration_id)
-            if k is None or message.is_extended_id or len(message.data) != INPUT.size:
+            if k is None or not is_data(message) or len(message.data) != INPUT.size:
                 self._hand_on(message)
             elif k in awaited:
                 channels[k].take(bytes(message.data))
@@ -584,7 +584,7 @@ class CanopenMotion:
 
     def _hand_on(self, message: can.Message) -> None:
         self._stranger = self._stranger or self._strangers.command(message)
-        if not (message.is_error_frame or message.is_remote_frame or message.is_extended_id):
+        if is_data(message):
             self._line.notify(message.arbitration_id, message.data, message.timestamp)
 
     def _word(self, channel: Channel, word: Controlword) -> bytes:

@@ -10,6 +10,7 @@ from collections.abc import Iterable, Sequence
 import can
 
 from drives.canopen_drive.drive import CanopenDrive
+from drives.canopen_drive.line import is_data
 
 SYNC_ID, NMT_ID, HEARTBEAT_ID, REQUEST_ID = 0x080, 0x000, 0x700, 0x600
 TARGET_IDS = (0x200, 0x300, 0x400, 0x500)
@@ -42,7 +43,7 @@ class Strangers:
 
     def command(self, message: can.Message) -> str:
         """Return what a frame commands, in words; empty if it is harmless, or the host's own echo."""
-        if not message.is_rx or message.is_extended_id or message.is_remote_frame:
+        if not (message.is_rx and is_data(message)):
             return ""
         identifier, data = message.arbitration_id, bytes(message.data)
         if identifier == NMT_ID:

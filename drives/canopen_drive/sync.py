@@ -7,7 +7,7 @@ from typing import Protocol
 import can
 
 from drives.bus.kernel_sync import LeasedSync
-from drives.canopen_drive.line import Line
+from drives.canopen_drive.line import Line, is_data
 from drives.canopen_drive.pace import LATE_SHARE
 from drives.errors import BusError
 
@@ -151,7 +151,7 @@ class KernelSync(HostSync):
                 self._origin, self._count = None, 0
                 overtaken = max(overtaken, patience)
                 self._lease.start(self._cycle_time)
-            elif message.arbitration_id != SYNC_ID or message.is_extended_id:
+            elif message.arbitration_id != SYNC_ID or not is_data(message):
                 early(message)
             elif (moment := self._moment(message)) < sent:
                 overtaken = max(overtaken, sent - moment)

@@ -10,7 +10,7 @@ from canopen.sdo import SdoAbortedError, SdoCommunicationError
 
 from drives import objects
 from drives.bus import frame_bits
-from drives.canopen_drive.line import SHORTEST_WAIT, Line, Node
+from drives.canopen_drive.line import SHORTEST_WAIT, Line, Node, is_data
 from drives.errors import ABORT_CODES
 from drives.objects import ObjectAddress, ObjectInfo
 
@@ -100,8 +100,7 @@ def who_answers(
 
 
 def _is_answer(message: can.Message) -> bool:
-    plain = not (message.is_error_frame or message.is_remote_frame or message.is_extended_id)
-    return plain and 0x581 <= message.arbitration_id <= 0x5FF and len(message.data) == 8
+    return is_data(message) and 0x581 <= message.arbitration_id <= 0x5FF and len(message.data) == 8
 
 
 def node_to_ask(line: Line, node_id: int, timeout: float = ANSWER) -> Node:

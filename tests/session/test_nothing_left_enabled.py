@@ -223,6 +223,79 @@ def motion_with(bench, frames):
         other.shutdown()
 
 
+BUS_OFF = 0x040
+CLASSES = [1 << bit for bit in range(10) if 1 << bit != BUS_OFF]
+LIKE_OURS = [base + node for base in (0x080, 0x180, 0x200, 0x300) for node in (TABLE, ARM)]
+"""Classes of error frames (``linux/can/error.h``): of one kind, and some that equal our identifiers."""
+
+
+@pytest.fixture
+def kernel_errors(monkeypatch):
+    """Have error frames read as the Linux kernel encodes them."""
+    monkeypatch.setattr(LockstepBus, "overruns", 0, raising=False)
+
+
+@pytest.mark.usefixtures("kernel_errors")
+@pytest.mark.parametrize("kind", [*CLASSES, *LIKE_OURS])
+def test_an_error_frame_is_nobodys_whatever_its_class(bench, kind):
+    frame = can.Message(arbitration_id=kind, is_extended_id=False, is_error_frame=True, dlc=8)
+    capture = motion_among(bench, frame)
+    assert capture.missing == ()
+    assert bench.powered() == {}
+
+
+@pytest.mark.usefixtures("kernel_errors")
+def test_an_adapter_that_goes_off_the_bus_stops_every_axis(bench):
+    frame = can.Message(arbitration_id=BUS_OFF, is_extended_id=False, is_error_frame=True, dlc=8)
+    with pytest.raises(SafetyStopError, match="the adapter went off the bus: bus off"):
+        motion_among(bench, frame)
+    assert bench.powered() == {}
+
+
+@pytest.mark.parametrize("how", [{"is_extended_id": True}, {"is_remote_frame": True}])
+@pytest.mark.parametrize("identifier", [0x080, 0x77F, *LIKE_OURS, 0x600 + ARM])
+def test_what_is_no_frame_of_canopen_is_nobodys(bench, identifier, how):
+    frame = can.Message(arbitration_id=identifier, dlc=8, **{"is_extended_id": False, **how})
+    capture = motion_among(bench, frame)
+    assert capture.missing == ()
+    assert bench.powered() == {}
+
+
+def motion_among(bench, frame):
+    """Hold the position, with a frame before each SYNC and one after each of the table's PDOs."""
+    other = can.Bus(interface="fieldsim", channel=bench.channel)
+
+    def after(_time, cob_id, _data):
+        if cob_id == 0x180 + TABLE:
+            other.send(frame)
+
+    def source(before):
+        if before is not None and before.first_sync > 50:
+            return None
+        other.send(frame)
+        return motion.position[None, :]
+
+    try:
+        with bench.connected() as group, group.motion(0.002) as motion:
+            bench.machine.listen(after)
+            return motion.stream(source)
+    finally:
+        other.shutdown()
+
+
+@pytest.mark.parametrize("kind", [0x080, 0x200 + ARM])
+def test_an_error_frame_is_no_other_master(bench, kind):
+    other = can.Bus(interface="fieldsim", channel=bench.channel)
+    frame = can.Message(arbitration_id=kind, is_extended_id=False, is_error_frame=True, dlc=8)
+    task = other.send_periodic(frame, 0.05)
+    try:
+        with bench.connected() as group:
+            assert group.line.troubles
+    finally:
+        task.stop()
+        other.shutdown()
+
+
 def test_short_emergencies_and_empty_heartbeats_do_no_harm(bench):
     other = can.Bus(interface="fieldsim", channel=bench.channel)
     try:

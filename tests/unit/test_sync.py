@@ -91,6 +91,21 @@ def test_a_host_that_comes_late_is_late(kernel):
     assert beat.late == 1
 
 
+@pytest.mark.parametrize("how", [{"is_error_frame": True}, {"is_remote_frame": True}])
+def test_what_only_looks_like_a_sync_is_none(beat_on, how):
+    class Likeness(Kernel):
+        def receive(self, timeout: float) -> can.Message:
+            if self.asked % 2:
+                return super().receive(timeout)
+            self.asked += 1
+            return frame(SYNC_ID, timestamp=self.day, **how)
+
+    line, early = Likeness(), []
+    line.pass_by(0.002)
+    assert beat_on(line).give(early.append) == pytest.approx(5.0 + CYCLE)
+    assert len(early) == 1, "it was handed on"
+
+
 class Deaf(Kernel):
     """Nothing comes back of what is sent."""
 
