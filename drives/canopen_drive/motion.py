@@ -184,7 +184,7 @@ class CanopenMotion:
             self._line.subscribe(0x80 + node_id, self._on_emergency)
             self._line.subscribe(0x700 + node_id, self._on_heartbeat)
         self._await_inputs()
-        self._check_replies()
+        self._check_replies(" No axis was enabled.")
         self._towards_enabled()
         slow = [c for c in self._channels if c.state is not PowerState.OPERATION_ENABLED]
         if slow:
@@ -205,7 +205,7 @@ class CanopenMotion:
             "takes part in SYNC (0x1005) and reached NMT operational."
         )
 
-    def _check_replies(self) -> None:
+    def _check_replies(self, so_far: str = "") -> None:
         """See that every drive answers a SYNC within its own cycle, not within the next one.
 
         After a pause without SYNC nothing old is on its way; a PDO that comes too late would be
@@ -221,7 +221,7 @@ class CanopenMotion:
         raise DriveFaultError(
             f"{late.drive.axis}: node {late.drive.node_id} answers a SYNC later than "
             f"{REPLY_SHARE:g} of the cycle of {self._cycle_time * 1000:g} ms, or the bus is too slow "
-            "or disturbed. Nothing was moved. Check the bus load, or use a longer cycle."
+            f"or disturbed.{so_far} Check the bus load, or use a longer cycle."
         )
 
     def _towards_enabled(self) -> None:

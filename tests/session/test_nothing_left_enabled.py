@@ -1,5 +1,7 @@
 """After a motion, however it ended: off, or said so, with the drive's own fail-safe still armed."""
 
+import re
+
 import can
 import numpy as np
 import pytest
@@ -7,6 +9,7 @@ import pytest
 from drives.canopen_drive import CanopenMotion
 from drives.errors import BusError, NothingMovedError, SafetyStopError
 from drives.sim.faults import SdoRefused, SdoSilent
+from drives.sim.frame_faults import PdoLate
 from drives.sim.host_faults import InterfaceDown
 from drives.sim.lockstep_bus import LockstepBus
 from fieldtool.workflow.session import never, open_session
@@ -338,6 +341,32 @@ def test_what_a_motion_left_is_said_when_a_later_step_fails(bench):
     assert bench.changed() == {ARM: {"0x6007:00": (1, 3)}}
     (note,) = refused.value.__notes__
     assert note.startswith("could not be put back: arm, object 0x6007:00: the drive refused")
+
+
+LATE = "arm: node 12 answers a SYNC later than 0.9 of the cycle of 2 ms"
+
+
+def test_pdos_that_come_late_for_good_are_said_before_an_axis_is_enabled(bench):
+    bench.inject(PdoLate(ARM))
+    with (
+        bench.connected() as group,
+        pytest.raises(NothingMovedError, match=rf"{LATE}, .* No axis was enabled\. Check the bus"),
+        group.motion(0.002),
+    ):
+        pass
+    assert bench.powered() == {}
+
+
+def test_pdos_that_come_late_in_a_motion_are_not_told_as_if_nothing_had_moved(bench):
+    with (
+        bench.connected() as group,
+        pytest.raises(SafetyStopError, match=rf"{LATE}, .* at the end of a motion") as stopped,
+        group.motion(0.002) as motion,
+    ):
+        bench.inject(PdoLate(ARM))
+        motion.stream(held(motion.position))
+    assert not re.search("(?i)nothing was moved|no axis was enabled", str(stopped.value))
+    assert bench.powered() == {}
 
 
 @pytest.fixture
