@@ -21,7 +21,14 @@ from drives.canopen_drive.strangers import Strangers, commands
 from drives.canopen_drive.sync import HostSync, KernelSync
 from drives.canopen_drive.torque_offset import why_not
 from drives.cia402 import Mode
-from drives.errors import BusError, LimitsError, NothingMovedError, NotSupportedError, SdoError
+from drives.errors import (
+    BusError,
+    LimitsError,
+    NothingMovedError,
+    NotSupportedError,
+    SafetyStopError,
+    SdoError,
+)
 from drives.objects import ObjectInfo
 from drives.profile import AxisProfile, DriveProfile, MachineProfile, load_drive
 from drives.trace import traced
@@ -53,6 +60,8 @@ class CanopenGroup:
         """Sees every block of all motions; none where it is None."""
         self._unsure: dict[str, str] = {}
         """Axes that may still be enabled, and why, in words."""
+        self._moved = False
+        """Whether axes were enabled, in any motion."""
         self.punctuality = Punctuality()
         """How well the host has kept the cycles of all motions so far."""
 
@@ -124,9 +133,11 @@ class CanopenGroup:
             If a drive lacks a mode that measuring needs: better known before anything moves.
         SdoError, NotSupportedError
             If a drive does not take it; then those before have their old values again.
+        SafetyStopError
+            In place of all these where axes have moved before.
         """
-        self.check_can_measure()
-        with ExitStack() as stack:
+        with self._stopped_if_moved(), ExitStack() as stack:
+            self.check_can_measure()
             for drive in self._drives:
                 changes = self._changes(stack, drive)
                 for name in drive.profile.feed_forward:
@@ -168,11 +179,13 @@ class CanopenGroup:
             If torque offsets are asked for and no drive takes them.
         NothingMovedError
             If a drive can not be enabled.
+        SafetyStopError
+            In place of all these where axes have moved before.
         """
-        self._check(cycle_time, free)
-        bus = self.machine.bus
-        offsets = self._offset_axes(free) if torque_offset else frozenset()
-        with ExitStack() as stack:
+        with self._stopped_if_moved(), ExitStack() as stack:
+            self._check(cycle_time, free)
+            bus = self.machine.bus
+            offsets = self._offset_axes(free) if torque_offset else frozenset()
             for drive in self._drives:
                 changes = self._changes(stack, drive)
                 mode = Mode.CYCLIC_TORQUE if drive.axis in free else Mode.CYCLIC_POSITION
@@ -216,10 +229,26 @@ class CanopenGroup:
             stack.callback(motion.end)
             try:
                 motion.begin()
+                self._moved = True
                 yield motion
             except BaseException as error:
                 motion.stop(error)
                 raise
+
+    @contextmanager
+    def _stopped_if_moved(self) -> Iterator[None]:
+        """Where axes have moved, make a stop of an error that would say that nothing had."""
+        try:
+            yield
+        except (BusError, NothingMovedError, SdoError) as error:
+            if not self._moved:
+                raise
+            now = " ".join(self._unsure.values()) or "All are disabled now."
+            stopped = SafetyStopError(f"{error} Axes had moved before. {now}")
+            for note in getattr(error, "__notes__", ()):
+                if note not in now:
+                    stopped.add_note(note)
+            raise stopped from error
 
     def _sync(self, cycle_time: float) -> HostSync:
         if self.machine.bus.sync == "host":

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from drives.canopen_drive import CanopenMotion
-from drives.errors import BusError, NothingMovedError, SafetyStopError
+from drives.errors import BusError, NothingMovedError, SafetyStopError, SdoAbortError
 from drives.sim.faults import SdoRefused, SdoSilent
 from drives.sim.frame_faults import PdoLate
 from drives.sim.host_faults import InterfaceDown
@@ -341,6 +341,45 @@ def test_what_a_motion_left_is_said_when_a_later_step_fails(bench):
     assert bench.changed() == {ARM: {"0x6007:00": (1, 3)}}
     (note,) = refused.value.__notes__
     assert note.startswith("could not be put back: arm, object 0x6007:00: the drive refused")
+
+
+@pytest.mark.parametrize("how", [SdoRefused, SdoSilent])
+@pytest.mark.parametrize("place", [(0x6007, 0), (0x2010, 4)])
+def test_what_a_drive_refuses_once_axes_have_moved_is_a_stop(bench, how, place):
+    """As the next motion is set up, or feed-forward is switched off for it."""
+    said = rf"arm, object 0x{place[0]:04X}.* Axes had moved before\. All are disabled now\."
+    with bench.connected() as group:
+        with group.motion(0.002) as motion:
+            motion.stream(held(motion.position))
+        bench.inject(how(ARM, *place))
+        with (
+            pytest.raises(SafetyStopError, match=said),
+            group.without_feed_forward(),
+            group.motion(0.002),
+        ):
+            pass
+    assert bench.powered() == {}
+
+
+def test_what_a_drive_refuses_before_any_motion_is_no_stop(bench):
+    bench.inject(SdoRefused(ARM, 0x6007))
+    with (
+        bench.connected() as group,
+        pytest.raises(SdoAbortError, match="arm, object 0x6007:00: the drive refused"),
+        group.motion(0.002),
+    ):
+        pass
+
+
+@pytest.mark.parametrize("how", [SdoRefused, SdoSilent])
+def test_a_drive_that_refuses_its_set_up_in_a_sweep_is_no_refusal_before_motion(bench, how):
+    bench.in_sweep.append((how(ARM, 0x6007), 0))
+    outcome = bench.measure()
+    assert outcome.code == 4, outcome.err
+    assert "arm, object 0x6007:00" in outcome.err
+    assert "Axes had moved before. All are disabled now." in outcome.err
+    assert "could not be put back: arm, object 0x6007:00" in outcome.err
+    assert bench.powered() == {}
 
 
 LATE = "arm: node 12 answers a SYNC later than 0.9 of the cycle of 2 ms"
