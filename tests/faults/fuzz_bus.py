@@ -1,7 +1,8 @@
 """Random frames on the bus while the whole tool works, and wrong SDO answers of every kind.
 
 The host hears them; the drives do not, so that whatever a drive holds at the end was written by the
-tool.  Three kinds: bystanders (identifiers that are nobody's here), look-alikes (the nodes' own
+tool.  Four kinds: bystanders (identifiers that are nobody's here), likenesses (29-bit, remote and error
+frames, which CANopen does not use, with the look-alikes' identifiers), look-alikes (the nodes' own
 identifiers with any content and length, and what only a master may send), and answers (SDO answers
 right before and after the true one, made from the request).
 """
@@ -14,12 +15,14 @@ from pathlib import Path
 from random import Random
 from typing import Any
 
+import can
+
 from drives.sim.entries import ENTRIES
 from fieldtool.errors import FieldtoolError
 from fieldtool.records.recording import load
 from tests.faults.bench import ARM, GAINS, TABLE, Bench, Moment, command
 
-KINDS = ("bystanders", "look-alikes", "answers")
+HARMLESS = ("bystanders", "likenesses")
 CODES = (0, 3, 4, 5, 6, 7)
 OURS = {base + node for node in (TABLE, ARM) for base in (0x80, 0x180, 0x580, 0x600, 0x700)}
 COMMANDS = {0x000, 0x080, 0x77F} | {
@@ -49,7 +52,8 @@ class Noise:
 
     kind: str
     rate: float
-    """Frames a SYNC (a frame of the host's while parameters are written), or wrong answers a request."""
+    """Frames a SYNC (likenesses, and while parameters are written: a frame of the host's), or wrong
+    answers a request."""
     seed: int
     quiet: int = 0
     """Requests that are answered rightly first."""
@@ -75,11 +79,17 @@ class NoisyBench(Bench):
         self.watch.fault_time = 0.0
         self.noise, self._random, self.sent = noise, Random(noise.seed), 0
         self._left, self._asked = 0.0, 0
+        self._other: can.BusABC | None = None
+
+    def __exit__(self, *what: object) -> None:
+        if self._other is not None:
+            self._other.shutdown()
+        super().__exit__(*what)
 
     def _seen(self, cob_id: int, data: bytes | bytearray) -> bool:
         noise, request = self.noise, bytes(data)
         if noise.kind != "answers":
-            if cob_id == 0x80 or self.moment is Moment.WRITE:
+            if cob_id == 0x80 or noise.kind == "likenesses" or self.moment is Moment.WRITE:
                 self._left += noise.rate
                 while self._left >= 1:
                     self._left -= 1
@@ -99,12 +109,26 @@ class NoisyBench(Bench):
     def _say(self, cob_id: int, data: bytes) -> None:
         if self.sent < self.noise.at_most:
             self.sent += 1
-            self.machine.announce(cob_id, data)
+            if self.noise.kind == "likenesses":
+                self._say_likeness(cob_id, data)
+            else:
+                self.machine.announce(cob_id, data)
+
+    def _say_likeness(self, cob_id: int, data: bytes) -> None:
+        how = self._random.choice(("is_extended_id", "is_remote_frame", "is_error_frame"))
+        frame: dict[str, Any] = {"is_extended_id": False, how: True, "dlc": len(data)}
+        if how != "is_remote_frame":
+            frame["data"] = data
+        if self._other is None:
+            self._other = can.Bus(interface="fieldsim", channel=self.channel)
+        self._other.send(can.Message(arbitration_id=cob_id, **frame))
+        while self._other.recv(0) is not None:
+            pass  # what others said meanwhile
 
     def _any(self) -> tuple[int, bytes]:
         random = self._random
         data = random.randbytes(random.choice((0, 1, 2, 4, 6, 7, 8, 8, 8)))
-        if self.noise.kind == "look-alikes":
+        if self.noise.kind != "bystanders":
             return random.choice((*OURS, *COMMANDS)), data
         while (cob_id := random.randrange(0x800)) in OURS | COMMANDS:
             pass

@@ -5,17 +5,25 @@ from random import Random
 import pytest
 
 from tests.faults.bench import Moment
-from tests.faults.fuzz_bus import Noise, disturbed
+from tests.faults.fuzz_bus import HARMLESS, Noise, disturbed
 from tests.seeds import fresh_seed
 
 SEED = fresh_seed()
 
 
-def test_frames_that_are_nobodys_do_not_matter():
+@pytest.mark.parametrize("kind", HARMLESS)
+def test_frames_that_are_nobodys_do_not_matter(kind):
     print("seed", SEED)
-    outcome = disturbed(Noise("bystanders", 3.0, SEED))
+    outcome = disturbed(Noise(kind, 3.0, SEED))
     assert outcome.code == 0, outcome.said[:600]
     assert outcome.frames > 10_000
+    assert outcome.problems == ()
+
+
+def test_frames_that_are_not_canopens_do_not_matter_to_a_write():
+    outcome = disturbed(Noise("likenesses", 3.0, SEED), Moment.WRITE)
+    assert outcome.code == 0, outcome.said[:600]
+    assert outcome.frames > 300
     assert outcome.problems == ()
 
 
