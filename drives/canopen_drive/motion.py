@@ -13,6 +13,7 @@ import numpy as np
 
 from drives import objects
 from drives.api import Capture, FloatArray, MotionWatch, Onlooker, Source, Targets, joined
+from drives.canopen_drive.asked import Asked, mode_words, wanted_mode
 from drives.canopen_drive.channel import (
     INPUT,
     MISSING_ALLOWED,
@@ -31,7 +32,7 @@ from drives.canopen_drive.setup import HOST_HEARTBEAT, HOST_LOST_AFTER, HOST_NOD
 from drives.canopen_drive.strangers import Strangers
 from drives.canopen_drive.sync import HostSync, Sync
 from drives.canopen_drive.unseen import Learned
-from drives.cia402 import ENABLED_VALUE, STEP_TOWARDS_ENABLED, Controlword, Mode, PowerState
+from drives.cia402 import ENABLED_VALUE, STEP_TOWARDS_ENABLED, Controlword, PowerState
 from drives.errors import (
     MAY_BE_ENABLED,
     DriveFaultError,
@@ -97,6 +98,7 @@ class CanopenMotion:
         self._targets: Sequence[int] = ()
         """Of the cycle before, position units."""
         self._count = 0
+        self._asked = Asked(self._channels, cycle_time)
         self._strangers = Strangers(drives, HOST_NODE_ID)
         self._stranger = ""
         """What somebody else has commanded, in words."""
@@ -316,21 +318,11 @@ class CanopenMotion:
     def _wrong_mode(channel: Channel) -> str:
         """Return a sentence if a drive is in another mode than it was set to; else nothing."""
         drive = channel.drive
-        wanted = Mode.CYCLIC_TORQUE if channel.free else Mode.CYCLIC_POSITION
         try:
             shown = drive.read_int(objects.MODE_DISPLAY)
         except SdoError:  # one answer that is lost must not spoil what was measured
             shown = drive.read_int(objects.MODE_DISPLAY)
-        if shown == wanted.value:
-            return ""
-        names = {mode.value: mode.words for mode in Mode}
-        return (
-            f"{drive.axis}: the drive left mode {wanted.words} ({wanted.value}) by itself: object "
-            f"0x6061:00 shows {shown} ({names.get(shown, 'a mode of its maker')}), so it did not follow "
-            "its targets. All axes are disabled; what was measured in this motion is kept, but do not "
-            "rely on it. Look for what else sets the mode: an input, a program in the drive, another "
-            "master."
-        )
+        return "" if shown == wanted_mode(channel).value else mode_words(channel, shown)
 
     def _explain(self, cause: BaseException) -> None:
         """Add what the stopped axis' drive says of itself to the error, if that explains it."""
@@ -340,7 +332,7 @@ class CanopenMotion:
         if channel is not None and not channel.missing:
             with suppress(DrivesError):
                 wrong = self._wrong_mode(channel)
-                if wrong:
+                if wrong and wrong not in str(cause):
                     cause.add_note(wrong)
 
     def stop(self, cause: BaseException | None = None) -> None:
@@ -663,6 +655,14 @@ class CanopenMotion:
                     runaway=channel.is_stuck(target) or bool(channel.alarm),
                 )
         self._check_energy()
+        self._check_asked()
+
+    def _check_asked(self) -> None:
+        """Raise SafetyStopError where a drive that is asked is not as its PDOs say."""
+        found = self._asked.wrong()
+        if found is not None:
+            channel, said = found
+            raise SafetyStopError(said, axis=channel.drive.axis, cycle=self._count - 1)
 
     def _check_energy(self) -> None:
         """Raise SafetyStopError where the axes give back more energy than they were given."""

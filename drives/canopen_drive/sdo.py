@@ -26,7 +26,7 @@ CHANGING |= {*range(0x6061, 0x6065), *range(0x6077, 0x607A)}
 _DOWNLOAD_SEGMENT, _DOWNLOAD, _UPLOAD, _UPLOAD_SEGMENT, _ABORT = 0, 1, 2, 3, 4
 _ANSWER_TO = {_DOWNLOAD_SEGMENT: 1, _DOWNLOAD: 3, _UPLOAD: 2, _UPLOAD_SEGMENT: 0}
 """Server's command specifier by the client's."""
-_TOGGLE = 0x10
+_TOGGLE, _EXPEDITED, _SIZE_GIVEN = 0x10, 0x02, 0x01
 
 
 class StrictSdoClient(SdoClient):  # type: ignore[misc]
@@ -76,10 +76,19 @@ class StrictSdoClient(SdoClient):  # type: ignore[misc]
         self.send_request(sdo_request)
         return self._answer(bytes(sdo_request))
 
-    def forget_old(self) -> None:
-        """Take note of answers that nobody waited for, and drop them."""
+    def ask(self, index: int, subindex: int) -> None:
+        """Ask for an object and do not wait: its answer is among those that are forgotten later."""
+        place = struct.pack("<HB", index, subindex)
+        self._owed = (*self._owed, place)[-MOST_OWED:]
+        self.send_request(struct.pack("<B3s4x", _UPLOAD << 5, place))
+
+    def forget_old(self) -> list[bytes]:
+        """Take note of answers that nobody waited for, and drop them; return them."""
+        old: list[bytes] = []
         while not self.responses.empty():
-            self.unasked += not self._was_owed(bytes(self.responses.get_nowait()))
+            old.append(bytes(self.responses.get_nowait()))
+            self.unasked += not self._was_owed(old[-1])
+        return old
 
     def _was_owed(self, answer: bytes) -> bool:
         """Whether an answer that is passed over came late; else see whether it contradicts the last."""
@@ -140,6 +149,20 @@ class StrictSdoClient(SdoClient):  # type: ignore[misc]
     def abort(self, abort_code: int = 0x08000000) -> None:
         """Tell the drive that the transfer is over."""
         self.send_request(struct.pack("<B3sL", 0x80, self._place, abort_code))
+
+
+def expedited(answer: bytes, index: int, subindex: int) -> bytes | None:
+    """Return what an answer says that an object holds; None if it is no such answer, or in segments."""
+    if (
+        len(answer) != SDO_BYTES
+        or answer[0] >> 5 != _ANSWER_TO[_UPLOAD]
+        or not answer[0] & _EXPEDITED
+    ):
+        return None
+    if answer[1:4] != struct.pack("<HB", index, subindex):
+        return None
+    unused = answer[0] >> 2 & 0x03 if answer[0] & _SIZE_GIVEN else 0
+    return answer[4 : SDO_BYTES - unused]
 
 
 def _in_words(answer: bytes, request: bytes) -> str:

@@ -6,7 +6,7 @@ import pytest
 from canopen.objectdictionary import ObjectDictionary
 from canopen.sdo import SdoCommunicationError
 
-from drives.canopen_drive.sdo import StrictSdoClient
+from drives.canopen_drive.sdo import StrictSdoClient, expedited
 
 
 def place(index: int, subindex: int) -> bytes:
@@ -125,3 +125,32 @@ def test_a_contradicted_node_is_told_what_it_was_but_not_asked():
     with pytest.raises(SdoCommunicationError, match="two drives"):
         client.download(*A, (5).to_bytes(4, "little"))
     assert len(net.asked) == 2
+
+
+def test_what_is_asked_without_waiting_is_owed_once():
+    client, net = client_of((), (read(0x6061, 0, 8),), (read(0x6061, 0, 10),))
+    client.ask(0x6061, 0)
+    assert net.asked == [b"\x40" + place(0x6061, 0) + bytes(4)]
+    assert client.forget_old() == [], "nobody waits for it"
+    late = read(0x6061, 0, 8)
+    client.responses.put(late)
+    client.responses.put(late)
+    assert client.forget_old() == [late, late]
+    assert client.unasked == 1
+    client.ask(0x6061, 0)
+    assert client.upload(0x6061, 0) == (10).to_bytes(4, "little"), "not what was asked for before"
+    assert client.unasked == 1
+
+
+def test_what_an_answer_holds():
+    assert expedited(b"\x4f" + place(0x6061, 0) + b"\x0a\0\0\0", 0x6061, 0) == b"\x0a"
+    assert expedited(b"\x42" + place(0x6061, 0) + b"\x0a\0\0\0", 0x6061, 0) == b"\x0a\0\0\0"
+    for other in (
+        b"\x4f" + place(0x6061, 0) + b"\x0a\0\0",
+        b"\x4f" + place(0x6061, 1) + b"\x0a\0\0\0",
+        b"\x41" + place(0x6061, 0) + b"\x01\0\0\0",
+        b"\x60" + place(0x6061, 0) + b"\0\0\0\0",
+        b"\x80" + place(0x6061, 0) + b"\0\0\2\6",
+        b"",
+    ):
+        assert expedited(other, 0x6061, 0) is None
