@@ -197,8 +197,9 @@ def test_dry_friction_in_the_model_is_reckoned_with_in_the_trial(make_bench, pro
     # without it in the model, the same machine is not what was predicted
     model["effects"] = [one for one in model["effects"] if one["effect"] != "coulomb_friction"]
     path.write_text(yaml.safe_dump(model))
+    assert bench.command("restore", bench.out).code == 0
     outcome = write(bench)
-    assert outcome.code == 6
+    assert outcome.code == 6, outcome.err
     assert "was predicted" in outcome.err or "off the predicted one" in outcome.err
 
 
