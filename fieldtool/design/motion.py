@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from math import inf
 from typing import Any
 
 import numpy as np
@@ -45,6 +46,17 @@ class Curves:
     step_time: FloatArray
     step: FloatArray
     """Motor after a unit step of the reference, without feed-forward."""
+
+    def figures(self, band: float, watched: float = inf) -> MoveFigures:
+        """Return the motor's figures on its move, of the ways out and back the worse ones.
+
+        Parameters
+        ----------
+        band, watched
+            As :func:`fieldtool.design.figures.move_figures` wants them.
+        """
+        ways = [self.position] if self.back is self.position else [self.position, self.back]
+        return _worst([move_figures(self.time, self.reference, way, band, watched) for way in ways])
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +120,7 @@ def moved(
     band = move.settling_band
     speeds = np.gradient(motors, time, axis=1)
     return Moved(
-        _worst([move_figures(time, reference, way[0], band) for way in ways]),
+        curves.figures(band),
         _worst([move_figures(time, reference, way[1], band) for way in ways]),
         step_figures(time, stepped, 1.0),
         max(float(np.abs(way[2]).max()) for way in ways),

@@ -5,7 +5,6 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from drives.canopen_drive import CanopenDrive
-from fieldtool.design.figures import move_figures
 from fieldtool.design.predict import Prediction
 from fieldtool.design.servo import Servo
 from fieldtool.design.verdict import CYCLES, SLOWER, TIME_DOUBT
@@ -102,10 +101,8 @@ def check_no_worse(before: Prediction, after: Prediction, cycle: float) -> None:
     for old, new in zip(before.axes, after.axes, strict=True):
         if old.move is None or new.move is None or new.curves is None:
             continue
-        curves, band = new.curves, EDGE * new.move.band
-        ways = (curves.position, curves.back)
         was = old.move.settling_time
-        now = max(move_figures(curves.time, curves.reference, w, band).settling_time for w in ways)
+        now = new.curves.figures(EDGE * new.move.band).settling_time
         if now > (1 + TIME_DOUBT) * SLOWER * was + CYCLES * cycle:
             settles = f"settle in {now:.3g} s" if np.isfinite(now) else "not settle"
             raise PlanRefusedError(

@@ -2,12 +2,10 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from math import inf
 
 import numpy as np
 
 from fieldtool.design.excited import Periodic, excited
-from fieldtool.design.figures import move_figures
 from fieldtool.design.loops import Loops
 from fieldtool.design.machine import Machine, machine_of, respond
 from fieldtool.design.measured import (
@@ -50,16 +48,17 @@ class TrialRecords:
     def notes(self, compared: Sequence[Comparison]) -> tuple[str, ...]:
         """Return what has to be known of a comparison besides its figures, a sentence each."""
         found = []
-        for one, foreseen in zip(compared, self.plan.after.axes, strict=True):
-            shown = one.sensitivity_predicted
-            own = foreseen.margins.sensitivity_peak
-            if one.rubs and shown is not None:
+        for one in compared:
+            shown, own = one.sensitivity_predicted, one.loop_peak
+            if shown is None or own is None:
+                continue
+            if one.rubs:
                 found.append(
                     f"{one.axis}: dry friction holds it in the small excitation and makes the peak of "
                     f"sensitivity that this should show, {shown.peak:.3g}; the loop's own is {own:.3g} "
                     "by the model. What was measured is not compared with it."
                 )
-            elif shown is not None and shown.peak < HIDDEN * own:
+            elif shown.peak < HIDDEN * own:
                 found.append(
                     f"{one.axis}: dry friction holds it in the small excitation. Its peak of "
                     f"sensitivity is compared with what that should show, {shown.peak:.3g}; the loop's "
@@ -178,15 +177,10 @@ class TrialRecords:
             return None
         if axis.curves is None:
             return axis_figures([axis.move], axis.peak_torque, curve, axis.move.settling_time)
-        curves, band = axis.curves, axis.move.band
-        ways = (curves.position, curves.back)
         # narrower, it tells what touches the edge; cut short, what swings in the time that is watched
-        narrow, short = (
-            [move_figures(curves.time, curves.reference, way, width, seen) for way in ways]
-            for width, seen in ((INSIDE * band, inf), (band, self._watched(k)))
-        )
-        latest = max(axis.move.settling_time, *(one.settling_time for one in narrow))
-        vibration = max(one.residual_peak for one in short)
+        narrow = axis.curves.figures(INSIDE * axis.move.band)
+        latest = max(axis.move.settling_time, narrow.settling_time)
+        vibration = axis.curves.figures(axis.move.band, self._watched(k)).residual_peak
         moved = replace(axis.move, residual_peak=vibration)
         return axis_figures([moved], axis.peak_torque, curve, latest)
 
