@@ -58,6 +58,8 @@ class LoopProfile(Part):
     """N m/rad or N/m."""
     velocity_ff: NotNegative = 0.0
     """Share of the reference's velocity that is fed forward."""
+    viscous_ff: NotNegative = 0.0
+    """N m s/rad or N s/m: torque per velocity of the reference."""
     inertia_ff: NotNegative = 0.0
     """kg m2 or kg."""
 

@@ -73,6 +73,7 @@ _BARE: Mapping[str, str] = {
     "loop.position_p": "1/s",
     "loop.velocity_p": "N m s/rad",
     "loop.velocity_i": "N m/rad",
+    "loop.viscous_ff": "N m s/rad",
     "loop.inertia_ff": "kg m2",
 }
 """Units on rotary axes of bare numbers in machine profiles, by the last keys of their place."""

@@ -91,36 +91,38 @@ class Parameter(IntEnum):
     """rad/s: slower is standstill (0x606F)."""
     VELOCITY_THRESHOLD_TIME = 24
     """s that the axis must stay slow for standstill (0x6070)."""
+    VISCOUS_FF = 25
+    """N m s/rad: torque per velocity of the position reference."""
 
 
 class Derived(IntEnum):
     """What follows from parameters and hardware; columns after those of ``Parameter``."""
 
-    COUNTS_PER_UNIT = 25
-    VELOCITY_GAIN = 26
+    COUNTS_PER_UNIT = 26
+    VELOCITY_GAIN = 27
     """Share of the new value in the filtered velocity, 0..1."""
-    TORQUE_CLAMP = 27
+    TORQUE_CLAMP = 28
     """The smaller of torque limit and peak torque, N m."""
-    CURRENT_DECAY = 28
+    CURRENT_DECAY = 29
     """exp(-w h) of the current loop."""
-    CURRENT_MEAN = 29
+    CURRENT_MEAN = 30
     """Share of the old torque in the mean torque of a step."""
-    FILTER1 = 30
+    FILTER1 = 31
     """b0, b1, b2, a1, a2."""
-    FILTER2 = 35
-    PER_MILLE = 40
+    FILTER2 = 36
+    PER_MILLE = 41
     """1000 / rated torque, 1/(N m)."""
-    NOISE_PER_MILLE = 41
+    NOISE_PER_MILLE = 42
     """Standard deviation of the measured torque, 1/1000 of rated torque."""
-    MOTOR_SIGN = 42
+    MOTOR_SIGN = 43
     """1, or -1 where the motor's phases are swapped: it pushes against what is measured."""
-    ENCODER_HELD = 43
+    ENCODER_HELD = 44
     """1 while the encoder stands still whatever the motor does."""
-    MOTOR_HELD = 44
+    MOTOR_HELD = 45
     """1 while a brake or an obstacle holds the motor where it is."""
-    ENCODER_OFFSET = 45
+    ENCODER_OFFSET = 46
     """Counts by which the encoder is beside the motor."""
-    COLUMNS = 46
+    COLUMNS = 47
 
 
 class Reference(IntEnum):
@@ -357,6 +359,10 @@ def _control(signals, settings, step):  # type: ignore[no-untyped-def]
             + signals[Signal.INTEGRAL]
             + settings[Parameter.INERTIA_FF] * signals[Signal.ACCELERATION_REFERENCE]
         )
+        if mode != Reference.VELOCITY:
+            signals[Signal.TORQUE_REFERENCE] += (
+                settings[Parameter.VISCOUS_FF] * signals[Signal.VELOCITY_REFERENCE]
+            )
     wanted = signals[Signal.TORQUE_REFERENCE] + settings[Parameter.TORQUE_OFFSET]
     wanted = _filtered(signals, settings, Signal.FILTER1, Derived.FILTER1, wanted)
     wanted = _filtered(signals, settings, Signal.FILTER2, Derived.FILTER2, wanted)

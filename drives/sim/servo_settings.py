@@ -88,6 +88,7 @@ def ranges(rate: float) -> dict[Parameter, ParameterRange]:
         Parameter.POSITION_MAX: ParameterRange(-inf, inf, "rad"),
         Parameter.VELOCITY_THRESHOLD: ParameterRange(0.0, inf, "rad/s"),
         Parameter.VELOCITY_THRESHOLD_TIME: ParameterRange(0.0, 1e6, "s"),
+        Parameter.VISCOUS_FF: ParameterRange(0.0, 1e9, "N m s/rad"),
     }
 
 
@@ -119,4 +120,5 @@ def factory_values(hardware: DriveHardware, rate: float) -> dict[Parameter, floa
         Parameter.POSITION_MAX: inf,
         Parameter.VELOCITY_THRESHOLD: _STANDSTILL_COUNTS * rate / hardware.counts_per_unit,
         Parameter.VELOCITY_THRESHOLD_TIME: 0.01,
+        Parameter.VISCOUS_FF: 0.0,
     }

@@ -5,7 +5,7 @@ loop; so do the moves of the others.  All signals are half-waves (:mod:`fieldtoo
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from math import isfinite
 
 import numpy as np
@@ -26,14 +26,33 @@ MOVED = 2.0
 """Weight of the axis' own move beside those of the others."""
 DURING = 0.05
 """Weight of the following error before the move has ended, for the feed-forward."""
-MOST_FED = np.array([1.0, 1.3])
-"""Velocity feed-forward, and inertia feed-forward over the axis' own inertia, at most."""
+MOST_FED = 1.3
+"""Feed-forward of inertia and of friction, over what the axis has, at most."""
 ROOM = 1.15
 """Times the torque of a rigid axis with its friction, where that is above the limit whatever the gains:
 no gains are given up for less."""
 FED_NOISE = 3.0
 """RMS of the torque that rounded targets make by inertia feed-forward, over that allowed of the
 encoder's steps."""
+
+
+@dataclass(frozen=True)
+class Fed:
+    """What feed-forward of an axis may be chosen, and what there is to feed forward."""
+
+    velocity: bool
+    inertia: bool
+    friction: bool
+    """As torque per velocity of the reference."""
+    mass: float
+    """Of the axis, kg m2 or kg."""
+    viscous: float
+    """Viscous friction of the axis, N m s/rad or N s/m."""
+
+    @property
+    def free(self) -> NDArray[np.bool_]:
+        """Velocity, inertia, friction."""
+        return np.array([self.velocity, self.inertia, self.friction])
 
 
 class AxisMotion:
@@ -46,10 +65,9 @@ class AxisMotion:
         axis: int,
         moves: Sequence[TestMove],
         bounds: Bounds,
-        free: tuple[bool, bool],
-        mass: float,
+        fed: Fed,
     ) -> None:
-        self.bounds, self.move, self.free, self.mass = bounds, moves[axis], free, mass
+        self.bounds, self.move, self.fed, self.mass = bounds, moves[axis], fed, fed.mass
         others = [i for i in range(len(servos)) if i != axis]
         wave, s = grids.wave, 1j * grids.wave.omega
         self._wave, self._tick = wave, wave.duration / wave.samples
@@ -112,14 +130,12 @@ class AxisMotion:
     def fed_forward(self, servo: Servo) -> Servo:
         """Return a controller with the feed-forward that fits its feedback best."""
         gain, torque, pi = self._slow.gain(servo)
-        share, inertia = self._feed_forward(servo, 1 / (1 + gain * self._motor), torque, pi)[0]
-        loop = replace(servo.loop, velocity_ff=share, inertia_ff=inertia)
-        return replace(servo, loop=loop)
+        return self._feed_forward(servo, 1 / (1 + gain * self._motor), torque, pi)[0]
 
     def _feed_forward(
         self, servo: Servo, sensitivity: ComplexArray, torque: ComplexArray, pi: ComplexArray
-    ) -> tuple[tuple[float, float], FloatArray, ComplexArray]:
-        """Return the shares, errors of motor and last mass on the move (2, N), and the torque's phasors.
+    ) -> tuple[Servo, FloatArray, ComplexArray]:
+        """Return the controller, errors of motor and last mass on the move (2, N), the torque's phasors.
 
         Shares are those of least squares over the time after the move, and a little before it.
         """
@@ -127,25 +143,43 @@ class AxisMotion:
         parts = [pi * servo.loop.position_p * drive]
         parts.append(pi * self._slow.s * drive)
         parts.append(torque * self._slow.acceleration * drive * self.mass)
+        loop = servo.loop
+        known = [loop.velocity_ff, loop.inertia_ff / self.mass]
+        if self.fed.friction or loop.viscous_ff:
+            parts.append(torque * self._slow.s * drive * loop.velocity_p)
+            known.append(loop.viscous_ff / loop.velocity_p)
         spectra = self._plants[:, None, :] * np.stack(parts)
         if self._drag is not None:
             spectra[:, 0] += self._drag * sensitivity
         signals = wave.signal(spectra)
         signals[:, 0] -= self._wanted
         seen = signals * self._weight
-        known = np.array([servo.loop.velocity_ff, servo.loop.inertia_ff / self.mass])
-        best = _least_squares(seen, known, np.array(self.free), self._most_fed(servo))
-        errors = signals[:, 0] + best[0] * signals[:, 1] + best[1] * signals[:, 2]
-        phasors = parts[0] + best[0] * parts[1] + best[1] * parts[2]
-        return (float(best[0]), float(best[1]) * self.mass), errors, phasors
+        count = len(known)
+        free, most = self.fed.free[:count], self._most_fed(servo)[:count]
+        best = _least_squares(seen, np.array(known), free, most)
+        errors, phasors = signals[:, 0], parts[0]
+        for k, share in enumerate(best, 1):
+            errors, phasors = errors + share * signals[:, k], phasors + share * parts[k]
+        viscous = float(best[2]) * loop.velocity_p if count > 2 else 0.0
+        fed = replace(
+            loop,
+            velocity_ff=float(best[0]),
+            viscous_ff=viscous,
+            inertia_ff=float(best[1]) * self.mass,
+        )
+        return replace(servo, loop=fed), errors, phasors
 
     def _most_fed(self, servo: Servo) -> FloatArray:
-        """Return the largest shares of velocity and inertia: targets are rounded to encoder steps."""
-        alone = replace(servo.loop, velocity_ff=0.0, inertia_ff=self.mass)
+        """Return the largest shares of velocity, inertia, and friction (over the velocity's P).
+
+        Targets are rounded to encoder steps.
+        """
+        alone = replace(servo.loop, velocity_ff=0.0, viscous_ff=0.0, inertia_ff=self.mass)
         noise = replace(servo, loop=alone).target_noise(self.bounds.resolution)
-        if not (isfinite(noise) and isfinite(self.bounds.noise) and noise > 0):
-            return MOST_FED
-        return np.asarray(np.minimum(MOST_FED, [1.0, FED_NOISE * self.bounds.noise / noise]))
+        inertia = MOST_FED
+        if isfinite(noise) and isfinite(self.bounds.noise) and noise > 0:
+            inertia = min(inertia, FED_NOISE * self.bounds.noise / noise)
+        return np.array([1.0, inertia, MOST_FED * self.fed.viscous / servo.loop.velocity_p])
 
     def figures(self, servo: Servo) -> tuple[float, float]:
         """Return a smooth measure of the time outside of the band, s, and the move's largest torque."""
@@ -178,19 +212,23 @@ def _least_squares(
     Parameters
     ----------
     seen
-        Base and two columns of two signals, shape (2, 3, N).
+        Base and n columns of two signals, shape (2, 1 + n, N).
+    known
+        Shares of the columns where nothing better is found, shape (n,).
     """
     products = np.einsum("pin,pjn->ij", seen, seen)
     normal, base = products[1:, 1:], products[1:, 0]
     best = np.where(free, np.clip(known, 0.0, most), known)
-    for k in (0, 1, 0, 1) if free.all() else (0, 1):
-        if free[k]:
-            rest = base[k] + normal[k] @ best - normal[k, k] * best[k]
-            best[k] = float(np.clip(-rest / max(float(normal[k, k]), 1e-300), 0.0, most[k]))
-    if free.all():
-        pair = np.linalg.solve(normal + 1e-12 * np.trace(normal) * np.eye(2), -base)
-        if np.all((pair >= 0) & (pair <= most)):
-            return np.asarray(pair)
+    chosen = np.flatnonzero(free)
+    for k in np.tile(chosen, chosen.size):
+        rest = base[k] + normal[k] @ best - normal[k, k] * best[k]
+        best[k] = float(np.clip(-rest / max(float(normal[k, k]), 1e-300), 0.0, most[k]))
+    if chosen.size > 1:
+        inner = normal[np.ix_(chosen, chosen)]
+        fixed = base[chosen] + normal[chosen][:, ~free] @ best[~free]
+        every = np.linalg.solve(inner + 1e-12 * np.trace(inner) * np.eye(chosen.size), -fixed)
+        if np.all((every >= 0) & (every <= most[chosen])):
+            best[chosen] = every
     return best
 
 

@@ -19,7 +19,7 @@ from math import isfinite
 
 import numpy as np
 
-from fieldtool.design.axis_motion import AxisMotion
+from fieldtool.design.axis_motion import AxisMotion, Fed
 from fieldtool.design.grids import Bounds, Grids, closed_compliance, without
 from fieldtool.design.margins import BANDWIDTH_LEVEL
 from fieldtool.design.moves import TestMove
@@ -44,8 +44,7 @@ class AxisProblem:
         axis: int,
         moves: Sequence[TestMove],
         bounds: Bounds,
-        free: tuple[bool, bool],
-        mass: float,
+        fed: Fed,
     ) -> None:
         """Prepare.
 
@@ -61,10 +60,8 @@ class AxisProblem:
             One an axis.
         bounds
             To be kept.
-        free
-            Whether velocity and inertia feed-forward may be chosen.
-        mass
-            Of the axis, kg m2 or kg.
+        fed
+            What feed-forward of the axis may be chosen.
         """
         self.bounds, self.move = bounds, moves[axis]
         s = 1j * grids.omega
@@ -80,7 +77,7 @@ class AxisProblem:
         widths = bounds.bandwidths or (0.0,) * len(servos)
         held = [grids.omega[0] < WITHIN * widths[i] for i in (axis, *others)]
         self._held = [below if below.any() else None for below in held]
-        self._motion = AxisMotion(grids, servos, axis, moves, bounds, free, mass)
+        self._motion = AxisMotion(grids, servos, axis, moves, bounds, fed)
 
     def cost(self, servo: Servo) -> float:
         """Return the cost of a controller, s; above UNSTABLE where the loop is not stable."""

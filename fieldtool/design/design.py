@@ -15,6 +15,7 @@ from math import inf, isfinite
 
 import numpy as np
 
+from fieldtool.design.axis_motion import Fed
 from fieldtool.design.axis_problem import UNSTABLE, AxisProblem
 from fieldtool.design.drive_side import DriveSide
 from fieldtool.design.grids import FAR_GAIN, Bounds, Grids, grids_of
@@ -242,9 +243,10 @@ def _grids(task: Task) -> Grids:
 
 def _problem(task: Task, grids: Grids, servos: tuple[Servo, ...], axis: int) -> AxisProblem:
     side = task.sides[axis]
-    free = (side.has("velocity_ff"), side.has("inertia_ff"))
-    mass = task.model.axes[axis].total_mass
-    return AxisProblem(grids, servos, axis, task.moves, task.bounds(axis), free, mass)
+    model = task.model.axes[axis]
+    chosen = side.has("velocity_ff"), side.has("inertia_ff"), side.has("viscous_ff")
+    fed = Fed(*chosen, model.total_mass, model.total_friction)
+    return AxisProblem(grids, servos, axis, task.moves, task.bounds(axis), fed)
 
 
 def _searched(task: Task, axis: int) -> None:

@@ -12,7 +12,7 @@ GAINS = ("position_p", "velocity_p", "velocity_i")
 PID = ("pid_p", "pid_i", "pid_d")
 ABOVE_ZERO = ("position_p", "velocity_p", "pid_p", "pid_d")
 """Gains that no loop goes without: what rounds to 0 is one step of the drive's."""
-FEED_FORWARD = ("velocity_ff", "inertia_ff")
+FEED_FORWARD = ("velocity_ff", "viscous_ff", "inertia_ff")
 """That a design chooses."""
 FILTERS = (1, 2)
 CAUTIOUS = Timing()
@@ -241,12 +241,12 @@ class DriveSide:
         ]
 
     def largest(self, parameters: Mapping[str, float]) -> list[str]:
-        """Return gains and inertia fed forward that are the most that the drive holds, a phrase each."""
+        """Return gains and feed-forward that are the most that the drive holds, a phrase each."""
         told = self._told(parameters)
         holds = self._holds_beside(told)
         return [
             f"{name} {self.words(name, told[name])}"
-            for name in (*GAINS, *PID, "inertia_ff")
+            for name in (*GAINS, *PID, "viscous_ff", "inertia_ff")
             if name in holds
             if told[name] >= (1 - 1e-6) * holds[name].bounds[1]
         ]

@@ -9,7 +9,7 @@ from scipy.optimize import minimize
 from fieldtool.design.axis_problem import UNSTABLE, AxisProblem
 from fieldtool.design.drive_side import DriveSide
 from fieldtool.design.servo import Servo
-from fieldtool.records.closed_loop import AxisLoop, Biquad
+from fieldtool.records.closed_loop import Biquad
 from fieldtool.records.model import FloatArray
 
 NOTCH, LOW_PASS = "notch", "low-pass"
@@ -108,13 +108,12 @@ class Space:
                 filters.append(Biquad.notch(f, depth * pole, pole))
             else:
                 filters.append(Biquad.low_pass(f, float(np.exp(rest.pop(0)))))
-        loop = AxisLoop(
-            float(position),
-            float(velocity),
-            float(ratio * velocity * position),
-            template.loop.velocity_ff,
-            template.loop.inertia_ff,
-            tuple(filters) if side.filters else template.loop.filters,
+        loop = replace(
+            template.loop,
+            position_p=float(position),
+            velocity_p=float(velocity),
+            velocity_i=float(ratio * velocity * position),
+            filters=tuple(filters) if side.filters else template.loop.filters,
         )
         return Servo(loop, corner, template.timing)
 
@@ -160,7 +159,7 @@ def improve(problem: AxisProblem, best: Best, evaluations: int, spread: float = 
         },
     )
     if found.fun >= best.cost:
-        return best
+        return replace(best, servo=problem.fed_forward(template))
     return Best(space, problem.fed_forward(space.servo(found.x, template)), float(found.fun))
 
 

@@ -3,7 +3,7 @@
 ::
 
     e      = position_p (r - q) + velocity_ff r' - v       v = low-pass( q' )
-    torque = delay( filters( velocity_p e + velocity_i integral(e) + inertia_ff r'' ) )
+    torque = delay( filters( velocity_p e + velocity_i integral(e) + viscous_ff r' + inertia_ff r'' ) )
 
 A drive's loops are sampled.  At frequencies well below their rate the sampling shows as delays: half a
 period of the velocity's difference quotient, half a period that the torque is held, and the current
@@ -67,7 +67,8 @@ class Servo:
         """Return torque per reference with the axis locked, shape of ``s``, rad/s."""
         loop = self.loop
         followed = self._pi(s) * (loop.position_p + loop.velocity_ff * s)
-        return self._torque(s) * (followed + loop.inertia_ff * s * s * self._held(s))
+        fed = loop.viscous_ff * s + loop.inertia_ff * s * s * self._held(s)
+        return self._torque(s) * (followed + fed)
 
     def offset_gain(self, s: ComplexArray) -> ComplexArray:
         """Return torque per torque that is added before the filters, shape of ``s``, rad/s."""
@@ -109,7 +110,8 @@ class Servo:
         cycle, loop = self.timing.cycle, self.loop
         if cycle <= 0:
             return 0.0
-        velocity = np.sqrt(2.0) / cycle * loop.velocity_ff * loop.velocity_p
+        per_velocity = loop.velocity_ff * loop.velocity_p + loop.viscous_ff
+        velocity = np.sqrt(2.0) / cycle * per_velocity
         acceleration = np.sqrt(6.0) / cycle**2 * loop.inertia_ff
         return float(resolution / np.sqrt(12) * np.hypot(velocity, acceleration))
 

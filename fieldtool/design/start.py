@@ -78,6 +78,7 @@ def _begin(loop: AxisLoop, axis: AxisModel, side: DriveSide, lowest: float, top:
     present = side.present or {}
     share = 1.0 if side.has("velocity_ff") or side.is_pid else present.get("velocity_ff", 0.0)
     inertia = axis.total_mass if side.has("inertia_ff") else present.get("inertia_ff", 0.0)
+    viscous = axis.total_friction if side.has("viscous_ff") else present.get("viscous_ff", 0.0)
     servo = side.servo(
         {"position_p": 1.0, "velocity_p": 1.0, "velocity_i": 1.0}
         | {f"filter{k}_type": 0.0 for k in side.filters}
@@ -86,7 +87,7 @@ def _begin(loop: AxisLoop, axis: AxisModel, side: DriveSide, lowest: float, top:
     if side.has("velocity_filter"):
         corner = space.highest / (2 * np.pi)
     kept = servo.loop.filters  # of a drive whose filters can not be set
-    fed = replace(loop, velocity_ff=share, inertia_ff=inertia, filters=kept)
+    fed = replace(loop, velocity_ff=share, viscous_ff=viscous, inertia_ff=inertia, filters=kept)
     servo = Servo(fed, corner, side.timing)
     return Best(space, space.servo(space.vector(servo), servo), inf)  # within what the drive holds
 

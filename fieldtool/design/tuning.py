@@ -113,6 +113,7 @@ def as_parameters(servo: Servo, side: DriveSide | None = None) -> dict[str, floa
         "velocity_p": loop.velocity_p,
         "velocity_i": loop.velocity_i,
         "velocity_ff": loop.velocity_ff,
+        "viscous_ff": loop.viscous_ff,
         "inertia_ff": loop.inertia_ff,
     }
     if servo.velocity_filter != OFF:

@@ -3,7 +3,7 @@
 Each axis that is not free has a cascade, as servo drives have it::
 
     e = position_p (r - q) + velocity_ff r' - q'
-    torque = filters( velocity_p e + velocity_i integral(e) + inertia_ff r'' + offset )
+    torque = filters( velocity_p e + velocity_i integral(e) + viscous_ff r' + inertia_ff r'' + offset )
 
 q is the motor's position, r its reference, offset a torque that the host adds.  Drives run these
 loops at several kHz with a current loop of about 1 kHz; both are left out here, which holds while
@@ -70,6 +70,8 @@ class AxisLoop:
     inertia_ff: float = 0.0
     """kg m2 or kg."""
     filters: tuple[Biquad, ...] = ()
+    viscous_ff: float = 0.0
+    """N m s/rad or N s/m: torque per velocity of the reference, against friction."""
 
     def filtered(self, s: NDArray[np.complexfloating[Any, Any]]) -> ComplexArray:
         """Return the filters' gain at complex frequencies, rad/s, shape of ``s``."""
@@ -85,7 +87,8 @@ class AxisLoop:
     def gain_of_reference(self, s: complex) -> complex:
         """Return torque per reference with the axis locked, at a complex frequency, rad/s."""
         share = (self.position_p + s * self.velocity_ff) / (self.position_p + s)
-        return self.gain(s) * share + self.torque_shape(s) * self.inertia_ff * s * s
+        fed = self.viscous_ff * s + self.inertia_ff * s * s
+        return self.gain(s) * share + self.torque_shape(s) * fed
 
     def gain(self, s: complex) -> complex:
         """Return torque per position error at a complex frequency, rad/s."""
@@ -298,7 +301,8 @@ class ClosedLoop:
             b_r[place, k], b_v[place, k] = loop.position_p, loop.velocity_ff
             row = loop.velocity_p * error
             row[place] += loop.velocity_i
-            row_r, row_v = loop.velocity_p * loop.position_p, loop.velocity_p * loop.velocity_ff
+            row_r = loop.velocity_p * loop.position_p
+            row_v = loop.velocity_p * loop.velocity_ff + loop.viscous_ff
             place += 1
             for biquad in loop.filters:
                 (n2, n1, n0), (d1, d0) = biquad.numerator, biquad.denominator
@@ -325,8 +329,8 @@ def loop_from_parameters(values: Mapping[str, float], filters: Sequence[int] = (
     Parameters
     ----------
     values
-        By name, physical units: position_p, velocity_p, velocity_i, velocity_ff, inertia_ff,
-        filterK_type (0 off, 1 notch, 2 low-pass), filterK_frequency, filterK_zero_damping,
+        By name, physical units: position_p, velocity_p, velocity_i, velocity_ff, viscous_ff,
+        inertia_ff, filterK_type (0 off, 1 notch, 2 low-pass), filterK_frequency, filterK_zero_damping,
         filterK_pole_damping.
     filters
         Numbers K of the filters to look for.
@@ -358,4 +362,5 @@ def loop_from_parameters(values: Mapping[str, float], filters: Sequence[int] = (
         values.get("velocity_ff", 0.0),
         values.get("inertia_ff", 0.0),
         tuple(biquads),
+        values.get("viscous_ff", 0.0),
     )

@@ -67,6 +67,11 @@ class AxisModel:
         """Sum of the chain's masses, kg or kg m2."""
         return sum(m.value for m in self.masses)
 
+    @property
+    def total_friction(self) -> float:
+        """Viscous friction of its first and its last mass, N m s/rad or N s/m."""
+        return self.viscous_friction.value + self.load_friction.value
+
 
 @dataclass(frozen=True)
 class Coupling:

@@ -42,6 +42,7 @@ def without_feed_forward(drive: CanopenDrive, loop: AxisLoop) -> AxisLoop:
     return replace(
         loop,
         velocity_ff=0.0 if "velocity_ff" in switched else loop.velocity_ff,
+        viscous_ff=0.0 if "viscous_ff" in switched else loop.viscous_ff,
         inertia_ff=0.0 if "inertia_ff" in switched else loop.inertia_ff,
     )
 

@@ -1,4 +1,4 @@
-"""How good the design is: ``python tests/benchmarks/bench_design.py [limit|peers|random|time]``.
+"""How good the design is: ``bench_design.py [limit|peers|random|friction|time]``.
 
 limit    against a global search (differential evolution, long, on the true machine itself, with the
          same structure and the same bounds): time until motor and last mass have arrived, bandwidth.
@@ -8,6 +8,8 @@ peers    relay tuning (Ziegler-Nichols) and symmetric optimum on the total inert
          sensitivity, vibration after the move.
 random   machines whose tooling was changed, drives tuned for the old one, a model with errors: what
          the design does on the true machine.
+friction what feed-forward of friction brings to drives that have it (the EPOS4's two loops): predicted
+         following error and arrival over those of a design without it.
 time     seconds for three axes.
 
 All is judged on the true machine by frequency responses and eigenvalues; seeds vary and are printed.
@@ -24,11 +26,14 @@ from design_machines import RESOLUTION, TIMING, Case, case
 from design_rivals import Global, klipper_choice, moved, peaks, relay, symmetric_optimum
 
 from drives.profile import load_machine
+from drives.profile.loading import load_drive
 from fieldtool.design.decide import design, swing
 from fieldtool.design.machine import machine_of
+from fieldtool.design.no_worse import arrival
 from fieldtool.design.predict import predict
 from fieldtool.design.rule import DesignError, rule
 from fieldtool.design.servo import Servo
+from fieldtool.records.model import Estimate
 from fieldtool.workflow.models import truth_model
 
 NOISE = 0.01
@@ -189,6 +194,38 @@ def random(rng: np.random.Generator, machines: int) -> None:
     )
 
 
+def friction(rng: np.random.Generator, machines: int) -> None:
+    print(f"\n{machines} machines, viscous friction 0.5 to 10 times the inertia a second")
+    dual = load_drive("epos4-dual-loop").tunable
+    for share in (0.0, 1.0):
+        rows = []
+        for _ in range(machines):
+            lengths = tuple(int(n) for n in rng.integers(1, 3, int(rng.integers(1, 3))))
+            one = case(rng, lengths, 0.01)
+            rubbed = tuple(
+                replace(a, viscous_friction=Estimate(float(rng.uniform(0.5, 10)) * a.total_mass))
+                for a in one.found.axes
+            )
+            model, now = replace(one.found, axes=rubbed), {"velocity_ff": share}
+            found = []
+            for tunable in (dual - {"viscous_ff"}, dual):
+                sides = [replace(s, tunable=tunable, present=now) for s in one.sides]
+                prediction = design(model, sides, one.moves).prediction
+                assert prediction is not None
+                found.append(prediction.axes)
+            for before, after in zip(*found, strict=True):
+                assert before.move is not None
+                assert after.move is not None
+                error = after.move.following_error / before.move.following_error
+                rows.append((error, arrival(after) / arrival(before)))
+        error, later = np.median(rows, axis=0)
+        print(
+            f"  {share:.0%} of the velocity fed forward, {len(rows)} axes: following error "
+            f"{error:.2f} times (median; {min(rows)[0]:.2f} to {max(rows)[0]:.2f}), arrival {later:.3f}",
+            flush=True,
+        )
+
+
 def seconds(rng: np.random.Generator, machines: int) -> None:
     print("\nTime of the design for three axes (uncertainty included)")
     paper = truth_model(load_machine("paper-3x3"))
@@ -224,6 +261,7 @@ def main() -> None:
         "time": lambda rng: seconds(rng, given.machines or 3),
         "peers": lambda rng: peers(rng, given.machines or 10),
         "random": lambda rng: random(rng, given.machines or 20),
+        "friction": lambda rng: friction(rng, given.machines or 6),
         "limit": lambda rng: limit(rng, given.machines or 4, given.generations),
     }
     for name, part in parts.items():

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from drives.profile.loading import load_drive
 from fieldtool.design.drive_side import DriveSide
 from fieldtool.design.moves import TestMove, typical_move
 from fieldtool.design.rule import rule
@@ -14,6 +15,7 @@ from fieldtool.records.model import AxisModel, Coupling, Estimate, MachineModel
 
 TIMING = Timing(0.22e-3, 0.125e-3, 0.004)
 RESOLUTION = 2 * np.pi / 2**20
+TUNABLE = load_drive("reference").tunable
 TOOLING = (0.5, 3.0)
 """Factor of the end mass, and a joint up to three times as soft."""
 
@@ -88,7 +90,7 @@ def case(rng: np.random.Generator, lengths: Sequence[int], error: float) -> Case
         torque = 200.0 * total
         moves.append(typical_move(axis.name, (-2.0, 2.0), 6.0, 100.0, torque, total))
         sides.append(
-            DriveSide(axis.name, None, TIMING, torque, RESOLUTION, {}, as_parameters(servo))
+            DriveSide(axis.name, TUNABLE, TIMING, torque, RESOLUTION, {}, as_parameters(servo))
         )
     return Case(true, identified(true, error, rng), tuple(sides), tuple(moves), old)
 

@@ -32,7 +32,7 @@ WRITTEN = ("epos4", "novanta")
 CLOSE = {"epos4": 1e-3}
 """Relative; a PID with D on the error feeds the reference's velocity forward in steps, and how they are
 sampled is not known but found from the data.  Else 3e-4: rounding and noise."""
-GAINS = ("position_p", "velocity_p", "velocity_i", "inertia_ff")
+GAINS = ("position_p", "velocity_p", "velocity_i", "viscous_ff", "inertia_ff")
 
 
 def numbers(model: MachineModel) -> dict[str, float]:

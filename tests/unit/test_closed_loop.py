@@ -22,7 +22,8 @@ TWO_PI = 2 * np.pi
 def loop_for(total: float, rng: np.random.Generator, filters: tuple[Biquad, ...] = ()) -> AxisLoop:
     w = TWO_PI * rng.uniform(0.5, 1.2)
     feed, inertia = rng.uniform(0, 1), total * rng.uniform(0, 1)
-    return AxisLoop(w / 4, total * w, total * w * w / 4, feed, inertia, filters)
+    viscous = total * w * rng.uniform(0, 1)
+    return AxisLoop(w / 4, total * w, total * w * w / 4, feed, inertia, filters, viscous)
 
 
 def random_filters(rng: np.random.Generator) -> tuple[Biquad, ...]:
@@ -48,7 +49,8 @@ def state_space(closed: ClosedLoop) -> tuple[np.ndarray, ...]:
     Bp = np.vstack([np.zeros((n, m)), inverse @ pick])
     Cq = np.hstack([pick.T, np.zeros((m, n))])  # positions
     Cv = np.hstack([np.zeros((m, n)), pick.T])  # velocities
-    shapes, pi, p, kff, jff = [], [], np.zeros(m), np.zeros(m), np.zeros(m)
+    shapes, pi = [], []
+    p, kff, cff, jff = np.zeros((4, m))
     for k, loop in enumerate(closed.loops):
         num, den = np.array([1.0]), np.array([1.0])
         if loop is None:
@@ -64,11 +66,12 @@ def state_space(closed: ClosedLoop) -> tuple[np.ndarray, ...]:
             )
         )
         shapes.append(signal.tf2ss(num, den))
-        p[k], kff[k], jff[k] = loop.position_p, loop.velocity_ff, loop.inertia_ff
+        p[k], kff[k] = loop.position_p, loop.velocity_ff
+        cff[k], jff[k] = loop.viscous_ff, loop.inertia_ff
     held = np.array([loop is not None for loop in closed.loops], dtype=float)
     A1, B1, C1, D1 = (block_diag(*[s[i] for s in pi]) for i in range(4))
     A2, B2, C2, D2 = (block_diag(*[s[i] for s in shapes]) for i in range(4))
-    # e = P (r - q) + kff v - q',  torque = C1 x1 + D1 e + C2 x2 + D2 a
+    # e = P (r - q) + kff v - q',  torque = C1 x1 + D1 e + C2 x2 + D2 (cff v + jff a)
     E = -np.diag(p) @ Cq - np.diag(held) @ Cv
     n1, n2 = A1.shape[0], A2.shape[0]
     A = np.block(
@@ -79,7 +82,7 @@ def state_space(closed: ClosedLoop) -> tuple[np.ndarray, ...]:
         ]
     )
     Ein = np.hstack([np.diag(p), np.diag(kff), np.zeros((m, m))])
-    Ain = np.hstack([np.zeros((m, 2 * m)), np.diag(jff)])
+    Ain = np.hstack([np.zeros((m, m)), np.diag(cff), np.diag(jff)])
     torque_in = D1 @ Ein + D2 @ Ain
     B = np.vstack([Bp @ torque_in, B1 @ Ein, B2 @ Ain])
     C = np.block([[Cq, np.zeros((m, n1 + n2))], [D1 @ E, C1, C2]])
@@ -148,7 +151,8 @@ def test_time_steps_are_those_of_lsim(
 ) -> None:
     m, n, step = len(closed.loops), 400, 0.004
     loops = tuple(
-        None if one is None else replace(one, inertia_ff=0.0) for one in closed.loops
+        None if one is None else replace(one, viscous_ff=0.0, inertia_ff=0.0)
+        for one in closed.loops
     )  # lsim can not have the impulses of a bent reference's acceleration
     closed = ClosedLoop(closed.model, loops)
     growth = float(np.linalg.eigvals(closed.system_matrix()).real.max()) * n * step
@@ -199,6 +203,7 @@ def test_a_long_sine_settles_to_the_phasors(
         replace(
             loop_for(a.total_mass, fresh_rng, random_filters(fresh_rng)),
             velocity_ff=0.0,
+            viscous_ff=0.0,
             inertia_ff=0.0,
         )
         for a in model.axes
@@ -246,7 +251,7 @@ def test_compliance_closed_by_hand_is_the_response(closed: ClosedLoop, _run: int
     omega = TWO_PI * np.geomspace(0.3, 40, 30)
     loop = closed.loops[axis]
     assert loop is not None
-    plain = replace(loop, velocity_ff=1.0, inertia_ff=0.0)
+    plain = replace(loop, velocity_ff=1.0, viscous_ff=0.0, inertia_ff=0.0)
     loops = (*closed.loops[:axis], plain)
     position, _ = ClosedLoop(closed.model, loops).response(omega, axis)
     gain = np.array([plain.gain(1j * w) for w in omega])
@@ -314,12 +319,12 @@ def test_a_loop_for_each_axis_is_needed(
 def test_loop_from_parameters() -> None:
     values = {
         "position_p": 6.0, "velocity_p": 30.0, "velocity_i": 60.0, "velocity_ff": 0.5,
-        "inertia_ff": 2.0, "filter1_type": 1.0, "filter1_frequency": 40.0,
+        "viscous_ff": 0.7, "inertia_ff": 2.0, "filter1_type": 1.0, "filter1_frequency": 40.0,
         "filter1_zero_damping": 0.1, "filter1_pole_damping": 0.5, "filter2_type": 2.0,
         "filter2_frequency": 80.0, "filter2_zero_damping": 0.3, "filter2_pole_damping": 0.7,
     }  # fmt: skip
     assert loop_from_parameters(values) == AxisLoop(
-        6.0, 30.0, 60.0, 0.5, 2.0, (Biquad.notch(40.0, 0.1, 0.5), Biquad.low_pass(80.0, 0.7))
+        6.0, 30.0, 60.0, 0.5, 2.0, (Biquad.notch(40.0, 0.1, 0.5), Biquad.low_pass(80.0, 0.7)), 0.7
     )
     values |= {"filter1_type": 0.0, "filter2_type": 0.0}
     assert loop_from_parameters(values).filters == ()

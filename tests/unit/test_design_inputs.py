@@ -222,11 +222,14 @@ def test_a_pid_that_no_cascade_is_can_not_be_compared(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("kind", "held", "said"),
     [
-        ("epos4-dual-loop", {"0x30AE:22": 0}, {"viscous_ff is 0 in the drive and stays so"}),
+        ("epos4-dual-loop", {"0x30AE:22": 5000}, set()),
         (
-            "epos4-dual-loop",
-            {"0x30AE:22": 5000},
-            {"viscous_ff (0.0005 N m s/rad) stays as it is in the drive"},
+            "epos4",
+            {"0x30A1:04": 5000, "0x30A1:05": 0},
+            {
+                "viscous_ff (5000 in the drive's own units) stays as it is in the drive",
+                "inertia_ff is 0 in the drive and stays so",
+            },
         ),
         (
             "epos4",
@@ -242,7 +245,7 @@ def test_a_pid_that_no_cascade_is_can_not_be_compared(tmp_path: Path) -> None:
 def test_feed_forward_that_no_design_chooses_is_said(
     tmp_path: Path, kind: str, held: dict[str, int], said: set[str]
 ) -> None:
-    """5000 uA s/rad at 0.1 N m/A.  Only what is not 0 makes moves differ from their prediction."""
+    """Only what is not 0 makes moves differ from their prediction."""
     folder = session(tmp_path, (kind, "reference"))
     held_before(folder, 0, held)
     side = drive_sides(folder, load_machine(folder.machine))[0]
@@ -255,7 +258,7 @@ def test_feed_forward_that_no_design_chooses_is_said(
 
 
 def test_feed_forward_that_nobody_read_is_said(tmp_path: Path) -> None:
-    folder = session(tmp_path, ("epos4-dual-loop", "reference"), backup=False)
+    folder = session(tmp_path, ("epos4", "reference"), backup=False)
     side = drive_sides(folder, load_machine(folder.machine))[0]
     none = AxisPrediction("table", None, None, None, None, 0.0, 0.0, 0.0)  # type: ignore[arg-type]
     assert any("viscous_ff (not known) stays as it is" in n for n in drive_notes(side, none, {}))

@@ -193,6 +193,7 @@ def cascades_of(model: MachineModel, rng: np.random.Generator) -> list[dict[str,
             "velocity_p": loop.velocity_p,
             "velocity_i": loop.velocity_i,
             "velocity_ff": 1.0,
+            "viscous_ff": float(rng.uniform(0, 1)) * loop.velocity_p,
             "inertia_ff": 0.7 * loop.inertia_ff,
             "velocity_filter": float(rng.uniform(40, 400)),
             "filter1_type": 2.0,
@@ -331,14 +332,15 @@ def test_a_count_makes_the_torque_that_the_firmware_makes_of_it(
 def test_noise_of_rounded_targets_as_the_firmware_makes_it() -> None:
     """A slow target in whole counts: its differences, fed forward, are the motor's torque."""
     step, cycle = 1e-4, 0.002
-    servo = Servo(AxisLoop(0.0, 2.0, 0.0, 1.0, 0.5), timing=Timing(0.0, 0.125e-3, cycle))
+    loop = AxisLoop(0.0, 2.0, 0.0, 1.0, 0.5, viscous_ff=3.0)
+    servo = Servo(loop, timing=Timing(0.0, 0.125e-3, cycle))
     axes = SimulatedAxes(
         PlantParameters((ChainParameters((1e9,), (), ()),)),
         [DriveHardware(1e6, 0.0, 1e9, 1e9)],
         1,
     )
-    for name, value in (("VELOCITY_P", 2.0), ("VELOCITY_FF", 1.0), ("INERTIA_FF", 0.5)):
-        axes.set(0, Parameter[name], value)
+    for name in ("velocity_p", "velocity_ff", "viscous_ff", "inertia_ff"):
+        axes.set(0, Parameter[name.upper()], getattr(loop, name))
     torque = []
     for n in range(3000):
         # a parabola: its whole counts are rounded as if by chance

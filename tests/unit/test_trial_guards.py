@@ -76,7 +76,8 @@ class Axis:
                 velocity, seen = (position - seen) / PERIOD, position
                 reference = last + (target - last) * k / loops
                 error = loop.position_p * (reference - position) + speed - velocity
-                wanted = loop.velocity_p * error + integral + loop.inertia_ff * bend
+                fed = loop.viscous_ff * speed + loop.inertia_ff * bend
+                wanted = loop.velocity_p * error + integral + fed
                 integral += loop.velocity_i * PERIOD * error
                 for one, state in zip(loop.filters, memory, strict=True):
                     wanted = filtered(one, state, wanted)
@@ -142,13 +143,14 @@ def first_alarm(one, position, torque, target):
     bandwidth=st.floats(15.0, 120.0),
     ratio=st.floats(2.0, 5.0),
     ahead=st.floats(0.0, 1.0),
+    against=st.floats(0.0, 1.0),
     friction=st.floats(0.0, 4.0),
     noise=st.floats(0.0, 0.03),
     notch=st.booleans(),
     seed=st.integers(0, 2**31),
 )
 def test_a_controller_that_was_written_is_never_doubted(
-    bandwidth, ratio, ahead, friction, noise, notch, seed
+    bandwidth, ratio, ahead, against, friction, noise, notch, seed
 ):
     filters = (Biquad.notch(120.0, 0.1, 0.7),) if notch else ()
     loop = AxisLoop(
@@ -158,6 +160,7 @@ def test_a_controller_that_was_written_is_never_doubted(
         1.0,
         ahead * INERTIA,
         filters,
+        against * bandwidth * INERTIA,
     )
     target, _ = trial_path(loop)
     sigma = noise * LIMIT
@@ -169,20 +172,33 @@ WRONG = {
     "gains ten times too high": {"velocity_p": 10.0, "velocity_i": 10.0},
     "gains of the wrong sign": {"velocity_p": -1.0, "velocity_i": -1.0},
     "feed-forward three times too high": {"inertia_ff": 3.0},
+    "feed-forward of friction twenty times too high": {"viscous_ff": 20.0},
 }
 
 
 @pytest.mark.parametrize("what", WRONG)
 def test_another_controller_shows_in_its_first_answer_within_some_counts(what):
-    held = replace(
-        GOOD, **{name: factor * getattr(GOOD, name) for name, factor in WRONG[what].items()}
-    )
-    target, hold = trial_path(GOOD)
-    position, torque = Axis(held).run(target, 0.02, 3)
-    found = first_alarm(watch(GOOD, noise=0.02), position, torque, target)
+    loop = replace(GOOD, viscous_ff=0.2 * GOOD.velocity_p)
+    changed = {name: factor * getattr(loop, name) for name, factor in WRONG[what].items()}
+    target, hold = trial_path(loop)
+    position, torque = Axis(replace(loop, **changed)).run(target, 0.02, 3)
+    found = first_alarm(watch(loop, noise=0.02), position, torque, target)
     assert found is not None
     assert found <= hold + 50
     assert np.abs(position[:found]).max() < 500 * COUNT
+
+
+@pytest.mark.parametrize("factor", [6.0, 10.0])
+def test_feed_forward_of_friction_that_is_too_high_shows_before_it_leads_far(factor):
+    loop = replace(GOOD, viscous_ff=0.2 * GOOD.velocity_p)
+    held = replace(loop, viscous_ff=factor * loop.viscous_ff)
+    target, _ = trial_path(loop)
+    position, torque = Axis(held).run(target, 0.02, 3)
+    found = first_alarm(watch(loop, noise=0.02), position, torque, target)
+    assert found is not None
+    right, _ = Axis(loop).run(target, 0.02, 3)
+    off = np.abs(position - right)
+    assert off[:found].max() < 500 * COUNT
 
 
 HIDDEN = {

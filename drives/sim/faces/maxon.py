@@ -1,8 +1,8 @@
 """maxon EPOS4, after the maker's units (uA/rad and so on), with one encoder and with two.
 
 Not imitated: the velocity observer and its filters, the main loop's filter, gain scheduling (the
-mean of both position gains acts), the feed-forward of the velocity (0x30A1:04, 0x30AE:22), other
-velocity units than revolutions a minute, and gains of the PID that no cascade has.
+mean of both position gains acts), the PID's feed-forward of the velocity (0x30A1:04), other velocity
+units than revolutions a minute, and gains of the PID that no cascade has.
 """
 
 from math import sqrt
@@ -17,7 +17,8 @@ _MICRO = 1_000_000
 _NOMINAL_CURRENT, _CURRENT_LIMIT, _TORQUE_CONSTANT = (0x3001, 1), (0x3001, 2), (0x3001, 5)
 _P, _I, _D, _ACCELERATION = (0x30A1, 1), (0x30A1, 2), (0x30A1, 3), (0x30A1, 5)
 _LOW, _HIGH = (0x30AE, 1), (0x30AE, 2)
-_AUXILIARY_P, _AUXILIARY_I, _AUXILIARY_ACCELERATION = (0x30AE, 0x20), (0x30AE, 0x21), (0x30AE, 0x23)
+_AUXILIARY_P, _AUXILIARY_I = (0x30AE, 0x20), (0x30AE, 0x21)
+_AUXILIARY_VELOCITY, _AUXILIARY_ACCELERATION = (0x30AE, 0x22), (0x30AE, 0x23)
 
 
 def _newton_metres(read: Read, key: Key) -> float:
@@ -83,7 +84,15 @@ class PositionPid(_EposLoops):
 class DualLoop(_EposLoops):
     """0x30AE: position P in 0.001/s on the load, velocity PI in uA on the motor."""
 
-    keys = (_LOW, _HIGH, _AUXILIARY_P, _AUXILIARY_I, _AUXILIARY_ACCELERATION, _TORQUE_CONSTANT)
+    keys = (
+        _LOW,
+        _HIGH,
+        _AUXILIARY_P,
+        _AUXILIARY_I,
+        _AUXILIARY_VELOCITY,
+        _AUXILIARY_ACCELERATION,
+        _TORQUE_CONSTANT,
+    )
 
     def factory(self) -> dict[Key, Value]:
         """Values for the start gains; both position gains alike."""
@@ -93,17 +102,19 @@ class DualLoop(_EposLoops):
             _HIGH: outer,
             _AUXILIARY_P: self._microamperes(self._gain(Parameter.VELOCITY_P)),
             _AUXILIARY_I: self._microamperes(self._gain(Parameter.VELOCITY_I)),
+            _AUXILIARY_VELOCITY: self._microamperes(self._gain(Parameter.VISCOUS_FF)),
             _AUXILIARY_ACCELERATION: self._microamperes(self._gain(Parameter.INERTIA_FF)),
         }
 
     def settings(self, read: Read) -> dict[Parameter, float]:
-        """Firmware parameters, SI; the reference's velocity is not fed forward."""
+        """Firmware parameters, SI; the reference's velocity is fed forward as torque alone."""
         return {
             **self._start,
             Parameter.VELOCITY_FF: 0.0,
             Parameter.POSITION_P: (float(read(*_LOW)) + float(read(*_HIGH))) / 2000,
             Parameter.VELOCITY_P: _newton_metres(read, _AUXILIARY_P),
             Parameter.VELOCITY_I: _newton_metres(read, _AUXILIARY_I),
+            Parameter.VISCOUS_FF: _newton_metres(read, _AUXILIARY_VELOCITY),
             Parameter.INERTIA_FF: _newton_metres(read, _AUXILIARY_ACCELERATION),
         }
 
@@ -124,7 +135,7 @@ def _values(motor: Motor) -> dict[Key, Value]:
 
 _OBJECTS, _HIDDEN = dressed(shipped("epos4.eds"))
 _NOT_IMITATED = (
-    "EPOS4: the velocity observer, filters, gain scheduling and feed-forward of the velocity",
+    "EPOS4: the velocity observer, filters, gain scheduling, and the PID's feed-forward of the velocity",
 )
 EPOS4 = Face(
     "epos4",

@@ -5,7 +5,8 @@ position that it measures with this torque.  A cycle of the bus holds several pe
 
     v  = low-pass( (q(t) - q(t - h)) / h )
     e  = position_p (r - q) + velocity_ff r' - v
-    torque = lag( filters( velocity_p e + velocity_i sum(e h) + inertia_ff r'' + offset ) )
+    f  = viscous_ff r' + inertia_ff r''
+    torque = lag( filters( velocity_p e + velocity_i sum(e h) + f + offset ) )
 
 All of it is linear, so one cycle is one matrix: from the state at a SYNC, the references of three
 SYNCs, the torque offset and the positions of four SYNCs (a cubic lies through them, slopes by central
@@ -27,7 +28,7 @@ from fieldtool.records.model import FloatArray
 REFERENCES, POSITIONS = 3, 4
 INPUTS = REFERENCES + 1 + POSITIONS
 PARTS = 5
-"""Of a torque: by reference what position gain, velocity gain and feed-forward of inertia (with the
+"""Of a torque: by reference what position gain, velocity gain and feed-forward of torque (with the
 offset) make; by position what position gain and velocity gain make."""
 FROM_REFERENCE, FROM_POSITION = slice(0, 3), slice(3, 5)
 LATE = 2
@@ -131,7 +132,7 @@ def _parted(drive: DriveLoop, step: float) -> tuple[FloatArray, FloatArray]:
     _, without = _cycle_matrix(replace(drive, loop=loop), step)
     offsets = np.zeros_like(whole)
     offsets[:, REFERENCES] = whole[:, REFERENCES]
-    bare = replace(loop, inertia_ff=0.0)
+    bare = replace(loop, viscous_ff=0.0, inertia_ff=0.0)
     _, velocity = _cycle_matrix(replace(drive, loop=bare), step)
     by_reference = np.arange(INPUTS) <= REFERENCES
     velocity = velocity - offsets
@@ -168,7 +169,8 @@ def _through_cycle(drive: DriveLoop, step: float, x: FloatArray, u: FloatArray) 
         x[0] = position
         reference = last + (target - last) * share
         error = loop.position_p * (reference - position) + loop.velocity_ff * speed - x[1]
-        torque = loop.velocity_p * error + x[2] + loop.inertia_ff * acceleration + offset
+        fed = loop.viscous_ff * speed + loop.inertia_ff * acceleration
+        torque = loop.velocity_p * error + x[2] + fed + offset
         x[2] += loop.velocity_i * h * error
         for j, (b0, b1, b2, a1, a2) in enumerate(filters):
             one, two = 3 + 2 * j, 4 + 2 * j

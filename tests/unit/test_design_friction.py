@@ -1,0 +1,78 @@
+"""Feed-forward against friction: what it should be on a rigid axis, and what it brings."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from drives.profile.loading import load_drive
+from fieldtool.design.axis_motion import _least_squares
+from fieldtool.design.decide import design
+from fieldtool.design.drive_side import DriveSide
+from fieldtool.design.moves import TestMove
+from fieldtool.design.no_worse import arrival
+from fieldtool.design.servo import Timing
+from fieldtool.records.model import AxisModel, Estimate, MachineModel
+
+TIMING = Timing(1e-6, 1e-6)
+STEP = 2 * np.pi / 2**20
+DUAL_LOOP = load_drive("epos4-dual-loop").tunable
+assert "viscous_ff" in DUAL_LOOP
+assert "velocity_ff" not in DUAL_LOOP
+
+
+def test_a_rigid_axis_gets_its_inertia_and_its_friction_fed_forward(
+    fresh_rng: np.random.Generator,
+) -> None:
+    """The drive feeds the whole velocity forward by itself, so torque is all that is lacking."""
+    mass, friction = fresh_rng.uniform(0.02, 0.2), fresh_rng.uniform(0.1, 1.0)
+    axis = AxisModel("x", "rotary", (Estimate(mass, 0.001 * mass),), (), ())
+    axis = replace(axis, viscous_friction=Estimate(friction, 0.001 * friction))
+    present = {"position_p": 1.0, "velocity_p": 1.0, "velocity_i": 0.0, "velocity_ff": 1.0}
+    side = DriveSide("x", DUAL_LOOP, TIMING, 100.0, present=present)
+    found = design(MachineModel((axis,)), [side]).axes[0].parameters
+    assert found["inertia_ff"] == pytest.approx(mass, rel=0.1)
+    assert found["viscous_ff"] == pytest.approx(friction, rel=0.05)
+
+
+def test_moves_follow_closer_with_it_and_arrive_no_later(fresh_rng: np.random.Generator) -> None:
+    """In the mean of rigid axes: the search does not end at the very best of each."""
+    ratios = []
+    for share in (0.0, 1.0, 1.0, 1.0):
+        mass, damping = fresh_rng.uniform(0.02, 0.2), fresh_rng.uniform(4.0, 10.0)
+        axis = AxisModel("x", "rotary", (Estimate(mass),), (), ())
+        axis = replace(axis, viscous_friction=Estimate(damping * mass))
+        move = TestMove("x", 1.0, 6.0, 100.0, 2000.0)
+        found = []
+        for tunable in (DUAL_LOOP - {"viscous_ff"}, DUAL_LOOP):
+            timing, present = Timing(0.22e-3, 0.125e-3, 0.004), {"velocity_ff": share}
+            side = DriveSide("x", tunable, timing, 400 * mass, STEP, present=present)
+            prediction = design(MachineModel((axis,)), [side], [move]).prediction
+            assert prediction is not None
+            found.append(prediction.axes[0])
+        before, after = found
+        assert before.move is not None
+        assert after.move is not None
+        closer = after.move.following_error / before.move.following_error
+        ratios.append((closer, arrival(after) / arrival(before)))
+    closer, later = np.exp(np.log(ratios).mean(axis=0))
+    assert closer < 0.95
+    assert later < 1.05
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_shares_are_the_best_within_their_bounds(
+    fresh_rng: np.random.Generator, count: int
+) -> None:
+    """Against a fine grid of all shares."""
+    seen = fresh_rng.standard_normal((2, 1 + count, 40))
+    seen[:, 0] -= np.tensordot(seen[:, 1:], fresh_rng.uniform(-0.2, 1.2, count), (1, 0))
+    most = fresh_rng.uniform(0.5, 1.5, count)
+    best = _least_squares(seen, np.zeros(count), np.ones(count, dtype=bool), most)
+    assert np.all((best >= 0) & (best <= most))
+
+    def left(shares: np.ndarray) -> float:
+        return float(((seen[:, 0] + np.tensordot(seen[:, 1:], shares, (1, 0))) ** 2).sum())
+
+    steps = np.stack(np.meshgrid(*[np.linspace(0, one, 31) for one in most]), -1)
+    assert left(best) <= 1.001 * min(left(one) for one in steps.reshape(-1, count))
