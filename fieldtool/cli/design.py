@@ -19,6 +19,7 @@ from fieldtool.design.drive_side import UNITS
 from fieldtool.design.predict import AxisPrediction
 from fieldtool.design.tuning import BOUND, MOST_BOUND, Tuning
 from fieldtool.design.tuning_file import tuning_as_dict
+from fieldtool.report.choices import choice_rows, choice_sentences, choice_titles
 from fieldtool.report.words import AT_ONCE
 
 Figure = Callable[[AxisPrediction], float | None]
@@ -60,6 +61,12 @@ def design(
         Path | None,
         typer.Option("--png", help="Draw sensitivity, step, move and trade (FILE.png)."),
     ] = None,
+    compare: Annotated[
+        bool,
+        typer.Option(
+            "--compare", help="Compute all responses, to choose from; as long as stiff takes."
+        ),
+    ] = False,
     as_json: Json = False,
 ) -> None:
     """Design controller parameters from the session folder's model, and predict what they do."""
@@ -70,7 +77,7 @@ def design(
         )
     console = console_of(as_json)
     with ShareBar(console, "design") as bar:
-        tuning = workflow.redesign(folder, response, bound, png, bar)
+        tuning = workflow.redesign(folder, response, bound, png, bar, compare=compare)
     show_tuning(console, tuning)
     for axis in tuning.axes:
         console.print(Text(f"{axis.axis}:"))
@@ -91,8 +98,23 @@ def show_tuning(console: Console, tuning: Tuning) -> None:
             console.print(table)
         if sentence := together(tuning):
             console.print(indented(sentence))
-    for sentence in (*(one.sentence for one in tuning.shaping), *tuning.notes):
+        if tuning.responses:
+            console.print(_choices(tuning))
+    for sentence in (
+        *choice_sentences(tuning),
+        *(one.sentence for one in tuning.shaping),
+        *tuning.notes,
+    ):
         console.print(indented(f"{sentence}"))
+
+
+def _choices(tuning: Tuning) -> Sheet:
+    """Return the responses side by side."""
+    titles = choice_titles(tuning)
+    table = Sheet(*titles, numbers=titles[2:], gap=1)
+    for row in choice_rows(tuning):
+        table.add(*row)
+    return table
 
 
 def together(tuning: Tuning) -> str:

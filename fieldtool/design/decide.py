@@ -1,7 +1,7 @@
 """From what a search found to what is written: rounded, checked again, compared, explained."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import inf, isfinite
 
 import numpy as np
@@ -30,6 +30,7 @@ from fieldtool.design.tuning import (
     RESPONSES,
     SOFTEST,
     AxisTuning,
+    Choice,
     TradePoint,
     Tuning,
     as_parameters,
@@ -55,6 +56,7 @@ def design(
     top: float | None = None,
     seed: int = SEED,
     advance: Advance = lambda *_: None,
+    compare: bool = False,
 ) -> Tuning:
     """Return parameters for every axis of an identified machine, and what they will do.
 
@@ -77,6 +79,9 @@ def design(
         Of the machines that are drawn from the uncertainty.
     advance
         Told what is done, and a number from 0 to 1.
+    compare
+        Whether responses that are stiffer than the chosen one are computed, too; softer ones are
+        anyhow.  The parameters are the same.
 
     Raises
     ------
@@ -102,24 +107,31 @@ def design(
     moves = default_moves(model, sides) if moves is None else tuple(moves)
     limit = None if top is None else 2 * np.pi * top
     softer: Softer | None = None
-    names = [name for name in RESPONSES if RESPONSES[name] <= RESPONSES[response]]
+    rooms = {name: 1 + (bound - 1) * share for name, share in RESPONSES.items()}
+    names = [name for name in RESPONSES if compare or RESPONSES[name] <= RESPONSES[response]]
+    choices = {name: Choice(name, room) for name, room in rooms.items()}
+    results: dict[str, _Result] = {}
     for k, name in enumerate(names):
 
-        def part(text: str, share: float, k: int = k) -> None:
-            advance(text, (k + share) / len(names))
+        def part(text: str, share: float, k: int = k, name: str = name) -> None:
+            advance(f"{name}: {text}", (k + share) / len(names))
 
-        room = 1 + (bound - 1) * RESPONSES[name]
+        room = rooms[name]
         try:
             task = find(model, sides, moves, room, limit, seed, part, softer)
             task.most = room if name == SOFTEST else bound
             task.softens = name == SOFTEST
             result = _at(task)
-        except DesignError:
+        except DesignError as error:
             if name == response:
                 raise
+            choices[name] = replace(choices[name], refused=str(error))
             continue  # what is softer may ask for too much
         softer = Softer(result.servos, result.prediction, result.instead or name)
-    return _tuning(result, response)
+        kept = tuple(sides[axis].axis for axis in sorted(result.kept))
+        choices[name] = Choice(name, room, result.prediction, kept, result.instead)
+        results[name] = result
+    return replace(_tuning(results[response], response), responses=tuple(choices.values()))
 
 
 def default_moves(model: MachineModel, sides: Sequence[DriveSide]) -> tuple[TestMove, ...]:

@@ -74,6 +74,23 @@ class TradePoint:
 
 
 @dataclass(frozen=True)
+class Choice:
+    """One of the three responses, as far as it was computed: what a technician chooses from."""
+
+    response: str
+    bound: float
+    """Peak of sensitivity that it asks for."""
+    prediction: Prediction | None = None
+    """What its parameters do; None where there are none."""
+    kept: tuple[str, ...] = ()
+    """Axes whose present parameters it keeps."""
+    instead: str = ""
+    """Softer response whose parameters these are, for nothing better keeps the margin; empty: none."""
+    refused: str = ""
+    """Why it can not be had; empty where it can, or was not computed."""
+
+
+@dataclass(frozen=True)
 class Tuning:
     """New parameters of all axes."""
 
@@ -92,6 +109,8 @@ class Tuning:
     """Advice for whatever makes the references; empty where no vibration is left."""
     notes: tuple[str, ...] = field(default=())
     """What a technician has to know, a sentence each."""
+    responses: tuple[Choice, ...] = ()
+    """From soft to stiff, the chosen one among them; empty where nobody chose."""
 
 
 def as_parameters(servo: Servo, side: DriveSide | None = None) -> dict[str, float]:

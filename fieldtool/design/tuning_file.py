@@ -11,7 +11,7 @@ from pydantic import Field
 from fieldtool.design.moves import TestMove
 from fieldtool.design.predict import Prediction, finite
 from fieldtool.design.shaping import Shaping
-from fieldtool.design.tuning import BOUND, MOST_BOUND, AxisTuning, TradePoint, Tuning
+from fieldtool.design.tuning import BOUND, MOST_BOUND, AxisTuning, Choice, TradePoint, Tuning
 from fieldtool.errors import FileFormatError
 from fieldtool.records.yaml_file import Number, StrictModel, read_checked
 
@@ -72,6 +72,15 @@ class _Shaping(StrictModel):
     unit: Literal["rad", "m"] = "rad"
 
 
+class _Choice(StrictModel):
+    response: str = Field(min_length=1)
+    bound: Number = Field(gt=1, le=MOST_BOUND)
+    prediction: _Prediction | None
+    kept: list[str]
+    instead: str
+    refused: str
+
+
 class _TuningFile(StrictModel):
     format: Literal["fieldtool-tuning/1"]
     response: str = ""
@@ -83,6 +92,7 @@ class _TuningFile(StrictModel):
     trade: list[_TradePoint] = Field(default_factory=list)
     shaping: list[_Shaping] = Field(default_factory=list)
     notes: list[str] = Field(default_factory=list)
+    responses: list[_Choice] = Field(default_factory=list)
 
 
 def tuning_as_dict(tuning: Tuning) -> dict[str, Any]:
@@ -114,6 +124,17 @@ def tuning_as_dict(tuning: Tuning) -> dict[str, Any]:
         ],
         "shaping": [one.as_dict() for one in tuning.shaping],
         "notes": list(tuning.notes),
+        "responses": [
+            {
+                "response": one.response,
+                "bound": one.bound,
+                "prediction": one.prediction.as_dict() if one.prediction else None,
+                "kept": list(one.kept),
+                "instead": one.instead,
+                "refused": one.refused,
+            }
+            for one in tuning.responses
+        ],
     }
 
 
@@ -144,6 +165,17 @@ def read_tuning(path: Path) -> Tuning:
             tuple(_point(one.model_dump()) for one in checked.trade),
             tuple(_shaping(one.model_dump()) for one in checked.shaping),
             tuple(checked.notes),
+            tuple(
+                Choice(
+                    one.response,
+                    one.bound,
+                    _prediction(one.prediction),
+                    tuple(one.kept),
+                    one.instead,
+                    one.refused,
+                )
+                for one in checked.responses
+            ),
         )
     except (KeyError, TypeError, ValueError) as error:
         raise FileFormatError(

@@ -7,6 +7,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from fieldtool.design.margins import Margins
 from fieldtool.design.predict import AxisPrediction
 from fieldtool.design.tuning import Tuning
 from fieldtool.errors import OutputError
@@ -110,6 +111,17 @@ def _shown(time: float, times: np.ndarray[tuple[int, ...], np.dtype[np.float64]]
     return min(time, float(times[-1]))
 
 
+def _others(tuning: Tuning, k: int) -> list[tuple[str, Margins]]:
+    """Return what one could have instead: the present parameters, and the other responses' own."""
+    there = [("before", tuning.present)]
+    there += [
+        (one.response, one.prediction)
+        for one in tuning.responses
+        if one.response != tuning.response and not one.instead
+    ]
+    return [(name, one.axes[k].margins) for name, one in there if one is not None and one.stable]
+
+
 def _trade(plot: Axes, tuning: Tuning, k: int) -> None:
     there = [p for p in tuning.trade if np.isfinite(p.sensitivity_peak[k])]
     bandwidth = [p.bandwidth[k] for p in there]
@@ -118,6 +130,11 @@ def _trade(plot: Axes, tuning: Tuning, k: int) -> None:
     for point in there:
         if point.factor == 1.0:
             plot.plot(point.bandwidth[k], point.sensitivity_peak[k], "o", color=AFTER)
+    for name, one in _others(tuning, k):
+        peak.append(one.sensitivity_peak)
+        place = (one.bandwidth, one.sensitivity_peak)
+        plot.plot(*place, "s", color=BEFORE if name == "before" else LOAD, ms=5)
+        plot.annotate(name, place, (4, -9), textcoords="offset points", fontsize=8)
     plot.axhline(tuning.bound, color="0.4", ls="--", lw=1)
     plot.set_ylim(0.9, max(1.5 * tuning.bound, min(max(peak, default=1.0), 4.0)))
     plot.set_xlabel("bandwidth [Hz], all gains scaled")

@@ -5,6 +5,7 @@ from math import isclose
 from typing import Any
 
 from fieldtool.design.tuning import Tuning
+from fieldtool.report.choices import choice_rows, choice_sentences, choice_titles
 from fieldtool.report.in_drives import state
 from fieldtool.report.material import Material
 from fieldtool.report.section import Block, Section, Table, Words
@@ -54,6 +55,15 @@ def parameters(material: Material) -> Section | None:
             "list",
         )
     )
+    if rows_of := choice_rows(material.tuning):
+        blocks.append(
+            Table(
+                choice_titles(material.tuning),
+                tuple(rows_of),
+                "The three responses, as predicted: what more bandwidth costs in margin.",
+            )
+        )
+        blocks.append(Words(tuple(choice_sentences(material.tuning)), "list"))
     if material.tuning.notes:
         blocks.append(Words(tuple(material.tuning.notes), "list"))
     return Section("Controller parameters", state(material), tuple(blocks))

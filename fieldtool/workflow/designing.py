@@ -33,6 +33,8 @@ def redesign(
     bound: float = BOUND,
     picture: Path | None = None,
     advance: Advance = lambda *_: None,
+    *,
+    compare: bool = False,
 ) -> Tuning:
     """Design parameters from a session folder's model and keep them there.
 
@@ -48,6 +50,9 @@ def redesign(
         PNG file to draw; none where it is None.
     advance
         Told what is done, and a number from 0 to 1.
+    compare
+        Whether responses that are stiffer than the chosen one are computed, too; softer ones are
+        anyhow.
 
     Raises
     ------
@@ -61,7 +66,7 @@ def redesign(
     machine = load_machine(folder.machine)
     model = model_of(machine, folder.model)
     check_known(model)
-    tuning = designed(folder, machine, model, response, bound, advance)
+    tuning = designed(folder, machine, model, response, bound, advance, compare=compare)
     if picture is not None:
         draw_design(tuning, machine_kinds(model), picture)
     return tuning
@@ -74,6 +79,8 @@ def designed(
     response: str = "normal",
     bound: float = BOUND,
     advance: Advance = lambda *_: None,
+    *,
+    compare: bool = False,
 ) -> Tuning:
     """Design for a machine, and write ``tuning.yaml``."""
     tuning = design(
@@ -84,6 +91,7 @@ def designed(
         bound=bound,
         top=_top(folder),
         advance=advance,
+        compare=compare,
     )
     if tuning.present is not None and written_since(folder.journal):
         tuning = replace(tuning, notes=(SINCE, *tuning.notes))
