@@ -1,7 +1,6 @@
 """The three responses side by side: what they promise, what was not computed, and what is not had."""
 
 from collections.abc import Callable
-from dataclasses import replace
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -16,8 +15,9 @@ from fieldtool.design import decide
 from fieldtool.design.decide import design
 from fieldtool.design.design import Task
 from fieldtool.design.drive_side import DriveSide
-from fieldtool.design.rule import DesignError
-from fieldtool.design.tuning import AxisTuning, Choice, Tuning
+from fieldtool.design.rule import DesignError, rule
+from fieldtool.design.servo import Servo
+from fieldtool.design.tuning import AxisTuning, Choice, Tuning, as_parameters
 from fieldtool.design.tuning_file import read_tuning, tuning_as_dict
 from fieldtool.records.model import MachineModel
 from fieldtool.records.yaml_file import write_yaml
@@ -27,7 +27,6 @@ from fieldtool.report.part_parameters import parameters
 from fieldtool.report.section import Table
 
 RandomModel = Callable[..., MachineModel]
-GAINS = {"position_p": 5.0, "velocity_p": 1.0, "velocity_i": 1.0}
 ROWS = {
     "bandwidth, Hz": lambda axis: axis["margins"]["bandwidth"],
     "peak of sensitivity": lambda axis: axis["margins"]["sensitivity_peak"],
@@ -38,9 +37,10 @@ ROWS = {
 
 
 def machine(random_model: RandomModel) -> tuple[MachineModel, list[DriveSide]]:
-    model = random_model(np.random.default_rng(8), (2, 1))
-    sides = [DriveSide(axis.name, torque_limit=200.0 * axis.total_mass) for axis in model.axes]
-    return model, [replace(side, present=GAINS) for side in sides]
+    model = random_model(np.random.default_rng(3), (2,))
+    present = as_parameters(Servo(rule(model)[0]))
+    mass = model.axes[0].total_mass
+    return model, [DriveSide(model.axes[0].name, torque_limit=200.0 * mass, present=present)]
 
 
 def refusing(monkeypatch: pytest.MonkeyPatch, step: str, *bounds: float) -> None:
@@ -206,7 +206,7 @@ def test_progress_tells_the_response_and_never_goes_back(random_model: RandomMod
 
 def test_a_response_that_keeps_present_parameters_says_of_which_axes() -> None:
     tuning = Tuning(
-        (AxisTuning("table", GAINS, 1.5, "why"),),
+        (AxisTuning("table", {"velocity_p": 4.2}, 1.5, "why"),),
         "normal",
         responses=(
             Choice("soft", 1.4, kept=("table", "arm")),

@@ -121,6 +121,13 @@ def test_the_command_says_what_is_there_and_what_will_be(
         assert axis["margins"]["sensitivity_peak"] <= 1.4 * 1.02
     assert data["present"]["stable"] is True
     assert yaml.safe_load(folder.tuning.read_text()) == data
+    there = {one["response"]: one["prediction"] is not None for one in data["responses"]}
+    assert there == {"soft": True, "normal": False, "stiff": False}
+    assert "normal and stiff: not computed yet; `fieldtool design FOLDER --response soft" in shown
+    main_code(["design", str(folder.path), "--response", "soft", "--compare", "--json"])
+    compared = yaml.safe_load(capsys.readouterr().out)
+    assert all(one["prediction"] or one["refused"] for one in compared["responses"])
+    assert compared | {"responses": []} == data | {"responses": []}, "the parameters are the same"
     assert main_code(["design", str(folder.path), "--response", "wild"]) == 2
     for bound in ("1", "3.1", "nan"):
         assert main_code(["design", str(folder.path), "--bound", bound]) == 2
