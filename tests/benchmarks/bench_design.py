@@ -239,10 +239,10 @@ def seconds(rng: np.random.Generator, machines: int) -> None:
 
     for k in range(machines):
         one = case(rng, (3, 3, 3), 0.01)
-        for name in ("normal", "stiff"):
+        for name, compare in (("normal", False), ("normal", True), ("stiff", False)):
             timed(
-                f"3 x 3 masses, machine {k + 1}, {name}",
-                partial(design, one.found, one.sides, one.moves, response=name),
+                f"3 x 3 masses, machine {k + 1}, {name}{', all three' if compare else ''}",
+                partial(design, one.found, one.sides, one.moves, response=name, compare=compare),
             )
     timed("paper-3x3, errors not known, normal", partial(design, paper))
 

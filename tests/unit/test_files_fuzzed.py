@@ -17,7 +17,7 @@ from drives.errors import ProfileError
 from drives.parameters import load_backup, load_journal
 from drives.profile import load_drive, load_machine, packaged
 from drives.sim.machine import simulated_machine
-from fieldtool.design.tuning import AxisTuning, Tuning
+from fieldtool.design.tuning import AxisTuning, Choice, Tuning
 from fieldtool.design.tuning_file import read_tuning, tuning_as_dict
 from fieldtool.errors import FieldtoolError, FileFormatError
 from fieldtool.identify.multisine.identify import identify_joint
@@ -78,7 +78,8 @@ def folder(tmp_path_factory):
     write_model(model, made / "model.yaml")
     gains = {"position_p": 20.0, "velocity_p": 2.0}
     tuned = tuple(AxisTuning(name, gains, 1.4, "why") for name in ("a", "b"))
-    write_yaml(made / "tuning.yaml", tuning_as_dict(Tuning(tuned)))
+    choices = (Choice("soft", 1.4, refused="too much"), Choice("normal", 1.7, kept=("a",)))
+    write_yaml(made / "tuning.yaml", tuning_as_dict(Tuning(tuned, responses=choices)))
     write_folder(recording(), made / "csv")
     save(recording(), made / "recording.h5")
     return made
