@@ -36,7 +36,7 @@ FIGURES: tuple[tuple[str, str, Callable[[AxisPrediction], float]], ...] = (
 def choice_titles(tuning: Tuning) -> tuple[str, ...]:
     """Return the titles of the table's columns; the chosen response is marked."""
     before = ("before",) if tuning.present else ()
-    return ("axis", "predicted", *before, *(_title(one, tuning) for one in tuning.responses))
+    return ("axis", "figure", *before, *(_title(one, tuning) for one in tuning.responses))
 
 
 def choice_rows(tuning: Tuning) -> list[tuple[str, ...]]:

@@ -104,7 +104,7 @@ def test_what_was_not_computed_is_said_with_the_command_that_does(
 ) -> None:
     model, sides = machine(random_model)
     tuning = design(model, sides, response="soft", bound=1.9)
-    assert choice_titles(tuning) == ("axis", "predicted", "before", "soft *", "normal", "stiff")
+    assert choice_titles(tuning) == ("axis", "figure", "before", "soft *", "normal", "stiff")
     assert set(column(tuning, "normal")) == set(column(tuning, "stiff")) == {"-"}
     assert "-" not in column(tuning, "soft *")
     assert [one.prediction is None for one in tuning.responses] == [False, True, True]
@@ -120,7 +120,7 @@ def test_the_screen_the_file_and_the_report_have_the_same_numbers(
     tuning = design(model, sides, compare=True)
     data = tuning_as_dict(tuning)
     titles = choice_titles(tuning)
-    assert titles == ("axis", "predicted", "before", "soft", "normal *", "stiff")
+    assert titles == ("axis", "figure", "before", "soft", "normal *", "stiff")
     rows = {(row[0], row[1]): dict(zip(titles, row, strict=True)) for row in choice_rows(tuning)}
     sources = {"before": data["present"]} | {
         one["response"] + " *" * (one["response"] == data["response"]): one["prediction"]
@@ -137,7 +137,7 @@ def test_the_screen_the_file_and_the_report_have_the_same_numbers(
     lines = text.splitlines()
     assert max(len(line.rstrip()) for line in lines) <= 80
     head = next(line for line in lines if "normal *" in line)
-    assert head.split() == ["axis", "predicted", "before", "soft", "normal", "*", "stiff"]
+    assert head.split() == ["axis", "figure", "before", "soft", "normal", "*", "stiff"]
     for row in choice_rows(tuning):
         assert " ".join(row) in " ".join(text.split())
     # the file, and the report that is made of it
