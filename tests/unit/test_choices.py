@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from matplotlib.figure import Figure
+from matplotlib.text import Annotation
 from rich.console import Console
 
 from fieldtool.cli.design import show_tuning
@@ -21,6 +23,7 @@ from fieldtool.design.tuning import AxisTuning, Choice, Tuning, as_parameters
 from fieldtool.design.tuning_file import read_tuning, tuning_as_dict
 from fieldtool.records.model import MachineModel
 from fieldtool.records.yaml_file import write_yaml
+from fieldtool.report import design_picture
 from fieldtool.report.choices import choice_rows, choice_sentences, choice_titles
 from fieldtool.report.material import Material
 from fieldtool.report.part_parameters import parameters
@@ -216,3 +219,20 @@ def test_a_response_that_keeps_present_parameters_says_of_which_axes() -> None:
     said = choice_sentences(tuning)
     assert said[0] == "soft keeps the present parameters of table and arm."
     assert not any(one.startswith("normal keeps") for one in said), "the design's own notes do"
+
+
+def test_the_picture_of_the_trade_has_what_else_there_is(
+    tmp_path: Path, random_model: RandomModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn: list[Figure] = []
+    monkeypatch.setattr(design_picture, "save_picture", lambda figure, *_: drawn.append(figure))
+    model, sides = machine(random_model)
+    refusing(monkeypatch, "no_worse", 2.0)
+    tuning = design(model, sides, compare=True)
+    design_picture.draw_design(tuning, {}, tmp_path / "design.png")
+    told = {one.get_text(): one.xy for one in drawn[0].axes[3].texts if isinstance(one, Annotation)}
+    assert set(told) == {"before", "soft"}, "stiff is what was chosen: normal"
+    for name, one in (("before", tuning.present), ("soft", tuning.responses[0].prediction)):
+        assert one is not None
+        margins = one.axes[0].margins
+        assert told[name] == (margins.bandwidth, margins.sensitivity_peak)
