@@ -56,6 +56,8 @@ class CanopenGroup:
         self._drives, self.stop_requested = tuple(drives), stop_requested
         self.warnings: list[str] = []
         """What could not be put back, in words."""
+        self.recovered: tuple[str, ...] = ()
+        """Faults of drives that a lost host had left behind, and that were reset, a sentence each."""
         self.onlooker: Onlooker | None = None
         """Sees every block of all motions; none where it is None."""
         self._unsure: dict[str, str] = {}
@@ -408,7 +410,7 @@ def connect(
             drive.read_scaling()
             drive.check_limits()
         group = CanopenGroup(line, machine, drives, stop_requested)
-        group.warnings += [said for said in recovered if said is not None]
+        group.recovered = tuple(said for said in recovered if said is not None)
         yield group
 
 

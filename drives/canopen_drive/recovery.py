@@ -5,6 +5,7 @@ from drives.canopen_drive.drive import CanopenDrive
 from drives.cia402 import Controlword, PowerState
 from drives.errors import DriveFaultError
 from drives.objects import ObjectAddress, ObjectInfo
+from drives.profile import UNKNOWN
 
 HOST_LOST = (0x8130, 0x8120)
 """Emergency codes: heartbeat (or life guarding) lost, CAN in error passive mode.  CiA 301."""
@@ -12,6 +13,17 @@ RESET_COMMUNICATION = 0x82
 BOOT_TIME, RESET_TIME = 5.0, 1.0
 """Seconds that a node may take to boot, and a drive to leave its fault."""
 _NEWEST = ObjectInfo(ObjectAddress(0x1003, 1), "UNSIGNED32", "standard error field")
+
+
+def lost_its_host(drive: CanopenDrive) -> int | None:
+    """Return the error code of a drive whose fault :func:`recover` ends; None if it is in no such one.
+
+    Nothing is written.
+    """
+    if drive.profile.recovery == UNKNOWN or drive.power_state() is not PowerState.FAULT:
+        return None
+    code = (drive.read_optional(_NEWEST) or 0) & 0xFFFF
+    return code if code in HOST_LOST else None
 
 
 def recover(drive: CanopenDrive) -> str | None:
@@ -25,11 +37,8 @@ def recover(drive: CanopenDrive) -> str | None:
     DriveFaultError
         If the drive stays in the fault.
     """
-    how = drive.profile.recovery
-    if how == "unknown" or drive.power_state() is not PowerState.FAULT:
-        return None
-    code = (drive.read_optional(_NEWEST) or 0) & 0xFFFF
-    if code not in HOST_LOST:
+    how, code = drive.profile.recovery, lost_its_host(drive)
+    if code is None:
         return None
     if how == "communication reset":
         drive.node.nmt.send_command(RESET_COMMUNICATION)

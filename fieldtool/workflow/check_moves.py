@@ -73,6 +73,8 @@ class MoveChecks:
         """
         try:
             with connect(self._machine, bus, stop_requested) as group:
+                for text in group.recovered:
+                    self._findings.note("fault reset", "pass", text)
                 folder = (
                     SESSIONS / f"check-{self._machine.path.stem}-{datetime.now():%Y%m%d-%H%M%S}"
                 )

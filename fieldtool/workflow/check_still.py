@@ -1,6 +1,7 @@
 """Check a drive that stands still: who it is, what it can do, what it is set to; nothing is written."""
 
 from drives.canopen_drive import CanopenDrive
+from drives.canopen_drive.recovery import lost_its_host
 from drives.canopen_drive.settings import read_settings
 from drives.cia402 import Mode
 from drives.profile import UNKNOWN
@@ -26,8 +27,7 @@ def check_still(drive: CanopenDrive, findings: Findings) -> None:
         return
     _objects(drive, findings)
     with findings.failing("power state", axis):
-        drive.check_idle()
-        findings.note("power state", "pass", drive.power_state().words, axis)
+        _power_state(drive, findings)
     with findings.failing("modes", axis):
         _modes(drive, findings)
     with findings.failing("units", axis) as went:
@@ -63,6 +63,21 @@ def _identity(drive: CanopenDrive, findings: Findings) -> None:
         drive.axis,
         "" if same else "Take the EDS of this firmware (`eds` of the axis).",
     )
+
+
+def _power_state(drive: CanopenDrive, findings: Findings) -> None:
+    code = lost_its_host(drive)
+    if code is not None:
+        findings.note(
+            "power state",
+            "warn",
+            f"fault 0x{code:04X}: it lost its host, for an earlier session ended without a word",
+            drive.axis,
+            f"The next command that moves it resets the fault ({drive.profile.recovery}).",
+        )
+        return
+    drive.check_idle()
+    findings.note("power state", "pass", drive.power_state().words, drive.axis)
 
 
 def _objects(drive: CanopenDrive, findings: Findings) -> None:

@@ -247,6 +247,8 @@ def open_session(
     session.screen.stage(f"Connect to {profile.name}")
     try:
         with connected(profile, stop_requested=stop_requested, trace=options.trace) as group:
+            for text in group.recovered:
+                session.warn(text)
             refuse_unfinished(profile.name, group.drives, folder.path)
             for drive in group.drives:
                 identity = drive.identity
