@@ -1,5 +1,7 @@
 """Every fault at every moment, and what came of it: ``python -m tests.benchmarks faults``.
 
+At the end those of an EPOS4, whose ways differ, at the moments at which they show.
+
 Run by itself it takes words of faults' names, and ``@`` with words of moments' names.
 
 Exit code, cycles until all drives that were under power had left operation enabled; where only motion
@@ -18,7 +20,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from tests.faults.bench import ARM, Moment
-from tests.faults.table import ROWS, problems, try_row
+from tests.faults.table import EPOS4_CASES, ROWS, problems, try_row
 
 MOMENTS = [word[1:] for word in sys.argv[1:] if word.startswith("@")]
 
@@ -32,10 +34,10 @@ def main() -> int:
         f"{'fault':36}{'moment':18}{'code':>5}{'cycles':>8}{'visible':>8}{'beyond':>8}{'deg':>8}"
         f"{'off s':>8}{'rad':>7}{'rows':>6}  outcome"
     )
-    for row in ROWS:
+    for row, times in (*((row, tuple(Moment)) for row in ROWS), *EPOS4_CASES):
         if words and not any(word in row.name for word in words):
             continue
-        for moment in moments:
+        for moment in (m for m in times if m in moments):
             result, expected = try_row(row, moment), row.expected(moment)
             found = problems(result, expected, moment)
             cases += 1

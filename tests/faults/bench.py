@@ -23,7 +23,7 @@ from unittest.mock import patch
 import yaml
 
 from drives.profile import load_machine
-from drives.sim.entries import ENTRIES
+from drives.sim.dictionary import Key
 from drives.sim.faults import Fault
 from drives.sim.lockstep_bus import register, unregister
 from drives.sim.machine import simulated_machine
@@ -41,9 +41,26 @@ TABLE, ARM = 11, 12
 NAMES = {TABLE: "table", ARM: "arm"}
 BITRATE = 500_000
 """Slow, so that the cycle is long and a case short."""
-GAINS = {(0x2010, 1): 20_000, (0x2010, 2): 2000, (0x2010, 3): 16_000}
-"""What the tuning that is written comes to in the drives, raw."""
 TUNING = {"velocity_p": 2.0, "velocity_i": 16.0, "position_p": 20.0}
+"""What is written, to any drive."""
+COEFFICIENT = {"epos4-dual-loop": {"main_filter_a": 1.5}}
+"""And, by kind, what such a drive works with only once its latch was set."""
+LATCHES = {"epos4-dual-loop": ((0x30AE, 0x40), (0x30AE, 0x10))}
+"""By kind: latch and coefficient."""
+GAINS: dict[str, dict[Key, int]] = {
+    "reference": {(0x2010, 1): 20_000, (0x2010, 2): 2000, (0x2010, 3): 16_000},
+    "epos4": {(0x30A1, 1): 560_000_000, (0x30A1, 2): 3_200_000_000, (0x30A1, 3): 20_000_000},
+    "epos4-dual-loop": {
+        (0x30AE, 0x10): 1500,
+        (0x30AE, 0x01): 20_000,
+        (0x30AE, 0x02): 20_000,
+        (0x30AE, 0x20): 20_000_000,
+        (0x30AE, 0x21): 160_000_000,
+    },
+}
+"""What it comes to in drives of each kind, raw.  An EPOS4's PID is P = 2 * 20 + 16 N m/rad,
+I = 20 * 16 N m/(rad s), D = 2 N m s/rad, in uA of a motor of 0.1 N m/A; with two loops both position
+gains are written."""
 REQUESTS, STILL_SYNCS, MOVING_SYNCS, WRITES = 3, 40, 60, 2
 """Requests of a node while connecting, SYNCs under power, changes of targets in the pilot, and gains
 written to a node, until the fault comes."""
@@ -112,6 +129,8 @@ class Result:
     """Whether a drive was enabled again after all had reacted."""
     restored: str
     """What was wrong with `fieldtool restore`, where something was left to be put back; else empty."""
+    not_acting: Mapping[int, tuple[Any, Any]] = field(default_factory=dict)
+    """By node: a coefficient that the drive holds and does not work with, as (works with, holds)."""
     best: Verdict | None = None
     """When somebody who knows all of the machine could have known; None where it was not asked."""
 
@@ -134,9 +153,11 @@ class Bench:
         objects: Mapping[int, Mapping[tuple[int, int], Any]] | None = None,
         factor: float | None = None,
         moving: int = MOVING_SYNCS,
+        writing: Key | None = None,
     ) -> None:
         self.folder, self.moment, self.node = folder, moment, node
         self._moving_syncs = moving
+        self._writing = writing
         self._faults = faults(node)
         self.channel = f"fault-{next(_numbers)}"
         profile = profile or two_axes()
@@ -148,7 +169,11 @@ class Bench:
             replace(d, objects=dict((objects or {}).get(d.node_id, {}))) for d in described.drives
         )
         self.machine: RunningMachine = register(self.channel, replace(described, drives=drives))
+        self._gains = {n.node_id: GAINS[n.face.name] for n in self.machine.nodes}
         self.before = {n.node_id: self._objects(n) for n in self.machine.nodes}
+        self._acting: dict[int, Any] = {}
+        for one in self.machine.nodes:
+            self._watch_filter(one)
         self._factor = factor
         self._received = Received(self.machine) if factor is not None else None
         self.watch = Watch()
@@ -174,6 +199,37 @@ class Bench:
     def out(self) -> Path:
         return self.folder / "session"
 
+    def _watch_filter(self, node: DriveNode) -> None:
+        """See which coefficient a drive works with: the one at its latch, or at its start."""
+        if node.face.name not in LATCHES:
+            return
+        latch, coefficient = LATCHES[node.face.name]
+        effects, power_up = node.dictionary.effects, node.motion.power_up
+        set_latch = effects[latch]
+
+        def take() -> None:
+            self._acting[node.node_id] = node.dictionary.read(*coefficient)
+
+        def latched(value: Any) -> None:
+            take()
+            set_latch(value)
+
+        def started() -> None:
+            take()
+            power_up()
+
+        take()
+        effects[latch] = latched
+        node.motion.power_up = started  # type: ignore[method-assign]
+
+    def _not_acting(self) -> dict[int, tuple[Any, Any]]:
+        held = {
+            n.node_id: n.dictionary.read(*LATCHES[n.face.name][1])
+            for n in self.machine.nodes
+            if n.node_id in self._acting
+        }
+        return {k: (acts, held[k]) for k, acts in self._acting.items() if acts != held[k]}
+
     # -- moments ----------------------------------------------------------------------------------
 
     def _seen(self, cob_id: int, data: bytes | bytearray) -> bool:
@@ -189,9 +245,12 @@ class Bench:
             self._requests += cob_id == 0x600 + self.node
             return self._requests >= REQUESTS
         if self.moment is Moment.WRITE:
-            gain = cob_id == 0x600 + self.node and data[1:3] == b"\x10\x20" and data[0] >> 5 == 1
-            self._writes += gain
-            return self._writes >= WRITES
+            if cob_id == 0x600 + self.node and data[0] >> 5 == 1:
+                key = int.from_bytes(data[1:3], "little"), data[3]
+                self._writes += key in self._gains[self.node]
+                if self._writing is not None:
+                    return key == self._writing
+            return self._writing is None and self._writes >= WRITES
         if cob_id - self.node == 0x200:
             self._moving += self._targets.get(cob_id, data)[2:6] != data[2:6]
             self._targets[cob_id] = data
@@ -208,7 +267,9 @@ class Bench:
 
     def _bring_about(self) -> None:
         watch = self.watch
-        watch.fault_time, self._period = self.machine.now, self.machine.period / 1e9
+        watch.fault_time = self.machine.now
+        if self.moment in (Moment.STILL, Moment.SWEEP):  # drives have no common cycle before
+            self._period = self.machine.period / 1e9
         watch.powered_then = frozenset(n.node_id for n in self.machine.nodes if n.motion.powered)
         watch.positions_then = {n.node_id: self._position(n) for n in self.machine.nodes}
         for fault in self._faults:
@@ -256,8 +317,13 @@ class Bench:
         self.out.mkdir()
         (self.out / "machine.yaml").write_text(self.profile.read_text(), encoding="utf-8")
         axes = [
-            {"axis": a, "parameters": dict(TUNING), "sensitivity_peak": 1.4, "reason": "bench"}
-            for a in NAMES.values()
+            {
+                "axis": NAMES[node.node_id],
+                "parameters": TUNING | COEFFICIENT.get(node.face.name, {}),
+                "sensitivity_peak": 1.4,
+                "reason": "bench",
+            }
+            for node in self.machine.nodes
         ]
         tuning = {"format": "fieldtool-tuning/1", "axes": axes}
         (self.out / "tuning.yaml").write_text(yaml.safe_dump(tuning), encoding="utf-8")
@@ -266,7 +332,7 @@ class Bench:
         rows, complete = self._recorded()
         nodes = self.machine.nodes
         best = self._best()
-        changed = self._all_changed()
+        changed, not_acting = self._all_changed(), self._not_acting()
         gains = {n.node_id: self._kind(n, n.dictionary.read) for n in nodes}
         stored = {n.node_id: self._kind(n, self._after_power_cycle(n)) for n in nodes}
         still_on = tuple(n.node_id for n in nodes if n.motion.powered)
@@ -283,6 +349,7 @@ class Bench:
             still_on,
             self._enabled_again,
             self._restored() if self._is_left(code, changed) else "",
+            not_acting,
             best,
         )
 
@@ -306,6 +373,7 @@ class Bench:
         code, said = command("restore", self.out)
         gains = {self._kind(n, n.dictionary.read) for n in self.machine.nodes}
         left = {} if self.moment is Moment.WRITE else self._all_changed()
+        left = left or self._not_acting()
         if code == 0 and gains == {"old"} and not left:
             return ""
         return f"restore: {code}, {gains}, {left}: {said}"
@@ -325,11 +393,12 @@ class Bench:
     # -- what drives hold -------------------------------------------------------------------------
 
     @staticmethod
-    def _objects(node: DriveNode) -> dict[tuple[int, int], Any]:
+    def _objects(node: DriveNode) -> dict[Key, Any]:
+        dictionary = node.dictionary
         return {
-            key: _as_on_the_wire(node.dictionary.read(*key))
-            for key, entry in ENTRIES.items()
-            if entry.access != "wo" and key not in PROCESS_VALUES
+            key: _as_on_the_wire(dictionary.read(*key))
+            for key, entry in dictionary.entries.items()
+            if entry.access != "wo" and key not in PROCESS_VALUES | dictionary.hidden
         }
 
     def _changed(self, node: DriveNode) -> dict[str, tuple[Any, Any]]:
@@ -337,21 +406,22 @@ class Bench:
         return {
             f"0x{key[0]:04X}:{key[1]:02X}": (was[key], now[key])
             for key in was
-            if was[key] != now[key] and key not in GAINS
+            if was[key] != now[key] and key not in self._gains[node.node_id]
         }
 
     def _kind(self, node: DriveNode, read: Callable[[int, int], Any]) -> str:
-        held = {key: read(*key) for key in GAINS}
-        if held == {key: self.before[node.node_id][key] for key in GAINS}:
+        new = self._gains[node.node_id]
+        held = {key: read(*key) for key in new}
+        if held == {key: self.before[node.node_id][key] for key in new}:
             return "old"
-        return "new" if held == GAINS else "mixed"
+        return "new" if held == new else "mixed"
 
     @staticmethod
     def _after_power_cycle(node: DriveNode) -> Callable[[int, int], Any]:
         stored = node.memory.stored
 
         def read(index: int, subindex: int) -> Any:
-            factory = node.dictionary.factory_value(ENTRIES[index, subindex])
+            factory = node.dictionary.factory_value(node.dictionary.entries[index, subindex])
             return stored.get((index, subindex), factory)
 
         return read

@@ -184,7 +184,7 @@ class NoisyBench(Bench):
                 continue
             place = f"0x{key[0]:04X}:{key[1]:02X}"
             if self.moment is Moment.WRITE:
-                right = now == GAINS.get(key) and code in (0, 7)
+                right = now == GAINS["reference"].get(key) and code in (0, 7)
             else:
                 right = now in SET_BY_TOOL.get(key, ()) and place in said
             if not right:

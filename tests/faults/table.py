@@ -7,6 +7,7 @@ moment by its nature, the table says so and why; then the command has to come to
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 from drives.sim.drive_faults import (
@@ -130,6 +131,8 @@ class Row:
     factor: float | None = None
     """What the fault makes of the torque that the drive tells, where only motion shows it: asked of the
     clairvoyant."""
+    writing: tuple[int, int] | None = None
+    """The object at whose writing the fault comes; otherwise after some gains."""
 
     def expected(self, moment: Moment) -> Expected:
         """Return what has to come at a moment."""
@@ -228,6 +231,16 @@ def with_coarse_encoder() -> dict[str, Any]:
     """Return a machine whose arm has an encoder of 2000 lines."""
     profile = two_axes()
     profile["simulation"]["axes"][1]["encoder_counts_per_rev"] = 8000
+    return profile
+
+
+def with_epos4(kind: str = "epos4") -> dict[str, Any]:
+    """Return the machine with an EPOS4 at its arm, which has its maker's objects, units and ways."""
+    profile = two_axes()
+    profile["axes"][1]["drive"] = kind
+    arm = profile["simulation"]["axes"][1]
+    arm["torque_constant"] = 0.1
+    arm["gains"]["velocity_ff"] = 1 if kind == "epos4" else 0
     return profile
 
 
@@ -590,9 +603,123 @@ ROWS: tuple[Row, ...] = (
 )
 
 
+def _with_epos4(name: str, kind: str = "epos4", **changes: Any) -> Row:
+    """Return a row of the table above for an EPOS4 in the faulty arm."""
+    row = next(row for row in ROWS if row.name == name)
+    return replace(row, name=f"{kind}: {name}", profile=partial(with_epos4, kind), **changes)
+
+
+def _dual(name: str, make: Callable[[int], tuple[Fault, ...]], write: Expected, **more: Any) -> Row:
+    """Return a fault of an EPOS4 with two loops while it is written to."""
+    profile = partial(with_epos4, "epos4-dual-loop")
+    kind = f"epos4-dual-loop: {name}"
+    return Row(kind, make, MEASURED, MEASURED, MEASURED, write, profile, **more)
+
+
+MOVING, ANY_TIME = (Moment.STILL, Moment.SWEEP), (Moment.STILL, Moment.SWEEP, Moment.WRITE)
+ON_WRITING = (Moment.WRITE,)
+LATCH, STORE = (0x30AE, 0x40), (0x1010, 1)
+EPOS4_CASES: tuple[tuple[Row, tuple[Moment, ...]], ...] = (
+    # its own heartbeat consumer's stop is a fault, and its fault reset waits for an NMT reset
+    (_with_epos4("host: bus off"), ANY_TIME),
+    (_with_epos4("host: killed"), ANY_TIME),
+    (_with_epos4("host: stalled 0.5 s"), MOVING),
+    (_with_epos4("drive reboots"), ANY_TIME),
+    (_with_epos4("node lost", write=mixed(r"arm \(node 12\).*pid_p 0x30A1:01")), ANY_TIME),
+    (_with_epos4("EMCY, over-current, fault"), (Moment.STILL, Moment.WRITE)),
+    (_with_epos4("store fails"), ON_WRITING),
+    (_with_epos4("power cut while storing"), ON_WRITING),
+    (_with_epos4("power cut while writing", write=mixed("arm.*pid_p 0x30A1:01")), ON_WRITING),
+    (
+        _with_epos4(
+            "value refused",
+            make=_one(lambda n: SdoRefused(n, 0x30A1, 2, 0x06090031)),
+            write=mixed("arm.*pid_i, object 0x30A1:02.*refused"),
+        ),
+        ON_WRITING,
+    ),
+    (
+        _with_epos4(
+            "value clipped",
+            make=_one(lambda n: WriteAltered(n, 0x30A1, 2, 1_000_000)),
+            write=mixed("arm, pid_i, object 0x30A1:02: wrote 3200000000, the drive holds 1000000 "),
+        ),
+        ON_WRITING,
+    ),
+    (
+        _dual(
+            "second position gain refused",
+            _one(lambda n: SdoRefused(n, 0x30AE, 2, 0x06090031)),
+            mixed("arm, position_p_high, object 0x30AE:02: .*refused to take 20000"),
+        ),
+        ON_WRITING,
+    ),
+    (
+        _dual(
+            "second position gain clipped",
+            _one(lambda n: WriteAltered(n, 0x30AE, 2, 9000)),
+            mixed("arm, position_p_high, object 0x30AE:02: wrote 20000, the drive holds 9000"),
+        ),
+        ON_WRITING,
+    ),
+    (
+        _dual(
+            "coefficient",
+            lambda _: (),
+            harmless("no fault: the coefficient acts, because its latch is set after it"),
+        ),
+        ON_WRITING,
+    ),
+    (
+        _dual(
+            "latch refused",
+            _one(lambda n: SdoRefused(n, *LATCH)),
+            mixed("arm, object 0x30AE:40: the drive refused.*main_filter_a 0x30AE:10"),
+        ),
+        ON_WRITING,
+    ),
+    (
+        _dual(
+            "lost at its latch",
+            _one(NodeVanishes),
+            mixed("arm.*0x30AE:40: node 12 did not answer"),
+            writing=LATCH,
+        ),
+        ON_WRITING,
+    ),
+    (
+        _dual(
+            "lost before it stores",
+            _one(NodeVanishes),
+            mixed("arm.*0x1010:01: node 12 did not answer"),
+            writing=STORE,
+        ),
+        ON_WRITING,
+    ),
+    *(
+        (
+            _dual(
+                f"power cut while storing, memory {bank}",
+                _one(partial(PowerLossWhileStoring, bank=bank)),
+                restored("arm, object 0x1010:01"),
+            ),
+            ON_WRITING,
+        )
+        for bank in ("old", "new", "corrupted")
+    ),
+)
+"""What an EPOS4 does in its own way, and when it is tried."""
+
+
 def try_row(row: Row, moment: Moment) -> Result:
     """Bring one fault about at one moment."""
-    return try_case(moment, row.make, profile=row.profile(), factor=row.factor)
+    return try_case(
+        moment,
+        row.make,
+        profile=row.profile(),
+        factor=row.factor,
+        writing=row.writing,
+    )
 
 
 def problems(result: Result, expected: Expected, moment: Moment) -> list[str]:
@@ -661,6 +788,8 @@ def _kept(result: Result, expected: Expected, moment: Moment) -> list[str]:
 
 
 def _written(result: Result) -> list[str]:
+    if result.not_acting and result.code in (0, 6):
+        return [f"held but not in use, as (in use, held): {result.not_acting}"]
     memory, stored = set(result.gains.values()), set(result.stored.values())
     if result.code == 0 and (memory, stored) != ({"new"}, {"new"}):
         return [f"not all new: working memory {result.gains}, stored {result.stored}"]
