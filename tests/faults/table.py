@@ -367,6 +367,22 @@ ROWS: tuple[Row, ...] = (
         seen_late("arm: node 12 answers a SYNC later than 0.9 of the cycle"),
         NOT_IN_USE,
     ),
+    Row(  # a watch that is behind by the one cycle that nobody can see is behind by no more
+        "PDO late for good, operation lost",
+        lambda n: (PdoLate(n), OperationLost(n)),
+        refused("arm: node 12 answers a SYNC later than 0.9 of the cycle"),
+        stopped(r"arm: the drive left operation enabled: statusword 0x0240"),
+        stopped(r"arm: the drive left operation enabled: statusword 0x0240"),
+        NOT_IN_USE,
+    ),
+    Row(
+        "PDO late for good, two cycles",
+        _one(lambda n: PdoLate(n, cycles=2.3)),
+        refused("arm: node 12 answers a SYNC later than 0.9 of the cycle"),
+        stopped(NO_PDO),
+        stopped(NO_PDO),
+        NOT_IN_USE,
+    ),
     Row("PDO twice, once", _one(lambda n: PdoTwice(n, 1)), ONCE, ONCE, ONCE, NOT_IN_USE),
     Row(
         "PDO twice for good",
