@@ -1,12 +1,14 @@
 """The CAN bus under everything: open one, tell its time, count what fits on it.
 
 ``opening`` opens whatever python-can opens, ``adapters`` knows python-can's interfaces and what they
-take, ``kernel_link`` and ``kernel_bus`` what only SocketCAN has, ``trouble`` reads error frames.
+take, ``kernel_link`` and ``kernel_bus`` what only SocketCAN has, ``frames`` tells CANopen's frames from
+others, ``trouble`` reads error frames.
 """
 
 from can import BusABC as Bus
 
 from drives.bus.clock import Clock, WallClock, clock_of, drives_begin_anew, not_imitated
+from drives.bus.frames import is_data
 from drives.bus.load import (
     MAX_CYCLIC_LOAD,
     CyclicLoad,
@@ -29,6 +31,7 @@ __all__ = [
     "close_bus",
     "drives_begin_anew",
     "frame_bits",
+    "is_data",
     "not_imitated",
     "open_bus",
     "shortest_cycle",

@@ -12,7 +12,7 @@ from math import inf
 import can
 import canopen
 
-from drives.bus import Clock, bus_state, clock_of, trouble_of
+from drives.bus import Clock, bus_state, clock_of, is_data, trouble_of
 from drives.canopen_drive.sdo import StrictSdoClient
 from drives.errors import BusError
 
@@ -23,11 +23,6 @@ NMT_ID, NMT_BYTES = 0x000, 2
 EMERGENCY_IDS, EMERGENCY_BYTES, HEARTBEAT_ID = (0x81, 0xFF), 8, 0x700
 SHORTEST_WAIT = 1e-4
 """Seconds; a difference of two times may be smaller than a clock can tell."""
-
-
-def is_data(message: can.Message) -> bool:
-    """Whether it is a frame of CANopen's; an error frame's class may equal any identifier."""
-    return not (message.is_error_frame or message.is_remote_frame or message.is_extended_id)
 
 
 class Line(canopen.Network):  # type: ignore[misc]

@@ -13,6 +13,7 @@ import numpy as np
 
 from drives import objects
 from drives.api import Capture, FloatArray, MotionWatch, Onlooker, Source, Targets, joined
+from drives.bus import is_data
 from drives.canopen_drive.asked import Asked, mode_words, wanted_mode
 from drives.canopen_drive.channel import (
     INPUT,
@@ -25,7 +26,7 @@ from drives.canopen_drive.channel import (
 from drives.canopen_drive.drive import CanopenDrive
 from drives.canopen_drive.energy import reversed_axis
 from drives.canopen_drive.interrupts import uninterrupted
-from drives.canopen_drive.line import Line, is_data
+from drives.canopen_drive.line import Line
 from drives.canopen_drive.outputs import Outputs, outputs_of
 from drives.canopen_drive.pace import LATE_SHARE, Punctuality
 from drives.canopen_drive.setup import HOST_HEARTBEAT, HOST_LOST_AFTER, HOST_NODE_ID

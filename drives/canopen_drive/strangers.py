@@ -9,8 +9,8 @@ from collections.abc import Iterable, Sequence
 
 import can
 
+from drives.bus import is_data
 from drives.canopen_drive.drive import CanopenDrive
-from drives.canopen_drive.line import is_data
 
 SYNC_ID, NMT_ID, HEARTBEAT_ID, REQUEST_ID = 0x080, 0x000, 0x700, 0x600
 TARGET_IDS = (0x200, 0x300, 0x400, 0x500)

@@ -6,8 +6,9 @@ from typing import Protocol
 
 import can
 
+from drives.bus import is_data
 from drives.bus.kernel_sync import LeasedSync
-from drives.canopen_drive.line import Line, is_data
+from drives.canopen_drive.line import Line
 from drives.canopen_drive.pace import LATE_SHARE
 from drives.errors import BusError
 

@@ -9,8 +9,8 @@ from canopen.objectdictionary import ObjectDictionary
 from canopen.sdo import SdoAbortedError, SdoCommunicationError
 
 from drives import objects
-from drives.bus import frame_bits
-from drives.canopen_drive.line import SHORTEST_WAIT, Line, Node, is_data
+from drives.bus import frame_bits, is_data
+from drives.canopen_drive.line import SHORTEST_WAIT, Line, Node
 from drives.errors import ABORT_CODES
 from drives.objects import ObjectAddress, ObjectInfo
 

@@ -18,6 +18,7 @@ from typing import Any, Protocol
 import can
 from can.typechecking import AutoDetectedConfig, CanFilters, Channel
 
+from drives.bus import is_data
 from drives.errors import DrivesError
 from drives.sim.firmware import SimulationDivergedError
 from drives.sim.machine import SimulatedMachine, simulated_machine
@@ -78,7 +79,7 @@ class _Line:
         """Carry a host's frame to the nodes and to the other bus objects."""
         if len(self.buses) > 1:
             self._to_others(sender, message)
-        if message.is_extended_id or message.is_remote_frame or message.is_error_frame:
+        if not is_data(message):
             return  # no service of these nodes uses them
         machine = self.machine
         try:

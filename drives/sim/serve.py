@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import can
 
-from drives.bus import WallClock
+from drives.bus import WallClock, is_data
 from drives.canopen_drive.pace import undisturbed
 from drives.cia402 import Mode
 from drives.sim.running import RunningMachine
@@ -112,7 +112,7 @@ def _served(
                 left_out += behind - LARGEST_STEP
                 now = machine.time + int(LARGEST_STEP * NANOSECONDS)
             machine.advance_to(now)
-            if message is not None and _is_for_nodes(message):
+            if message is not None and is_data(message):
                 machine.receive(message.arbitration_id, bytes(message.data))
             line.flush()
     finally:
@@ -174,7 +174,3 @@ def _compile(machine: RunningMachine) -> None:
         for _ in range(3):
             other.receive(0x80, b"")
             other.advance_to(other.time + nanoseconds(WARM_UP))
-
-
-def _is_for_nodes(message: can.Message) -> bool:
-    return not (message.is_extended_id or message.is_remote_frame or message.is_error_frame)
