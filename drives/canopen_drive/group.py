@@ -10,6 +10,7 @@ import can
 
 from drives.api import MotionWatch, Onlooker
 from drives.bus import CyclicLoad, check_cycle, close_bus, open_bus, shortest_cycle
+from drives.bus.opening import SOCKETCAN
 from drives.canopen_drive import fail_safe, setup
 from drives.canopen_drive.drive import CanopenDrive
 from drives.canopen_drive.interrupts import uninterrupted
@@ -64,7 +65,10 @@ class CanopenGroup:
         """Axes that may still be enabled, and why, in words."""
         self._moved = False
         """Whether axes were enabled, in any motion."""
-        self.punctuality = Punctuality()
+        bus = machine.bus
+        self.punctuality = Punctuality(
+            kernel_could=bus.interface == SOCKETCAN and bus.sync == "host"
+        )
         """How well the host has kept the cycles of all motions so far."""
 
     @property

@@ -29,9 +29,11 @@ class Punctuality:
     """Received frames that were lost because the host took them too late."""
     real_time: str = ""
     """Why the host has no real-time priority; empty where it has."""
+    kernel_could: bool = False
+    """Whether the kernel could give the SYNC, and the host does."""
 
     def plus(self, other: "Punctuality") -> "Punctuality":
-        """Return the two together."""
+        """Return the two together, on the bus of the first."""
         return Punctuality(
             self.cycles + other.cycles,
             self.late + other.late,
@@ -39,6 +41,7 @@ class Punctuality:
             other.cycle_time,
             self.overruns + other.overruns,
             other.real_time,
+            self.kernel_could,
         )
 
     @property
@@ -67,9 +70,14 @@ class Punctuality:
             if self.real_time and hasattr(os, "sched_setscheduler")
             else ""
         )
+        kernel = (
+            "let the kernel give the SYNC (`sync: kernel` under `bus` in the machine profile), "
+            if self.kernel_could and self.late
+            else ""
+        )
         return (
             "The blocks with them were measured again. To have fewer: close other programs, "
-            f"{allow}or give the bus a longer `shortest_cycle` in the machine profile."
+            f"{allow}{kernel}or give the bus a longer `shortest_cycle` in the machine profile."
         )
 
 
