@@ -22,7 +22,7 @@ from drives.profile.machine import (
 )
 from drives.profile.parameter import Condition, FilterInfo, Latch, ParameterInfo, Store, Unlock
 from drives.profile.scales import PositionScale, Quantity, SyncRules, TorqueScale
-from drives.profile.simulation import SimulatedAxisProfile, SimulationProfile
+from drives.profile.simulation import FaceProfile, SimulatedAxisProfile, SimulationProfile
 from drives.profile.values import DIMENSIONS, UNKNOWN, known
 from drives.profile.yaml_reader import MAX_PROFILE_BYTES, read_yaml
 
@@ -37,6 +37,7 @@ __all__ = [
     "CouplingProfile",
     "DriveProfile",
     "EffectProfile",
+    "FaceProfile",
     "FilterInfo",
     "Identity",
     "Latch",

@@ -67,13 +67,17 @@ def _named_in(file: Path | None, name: str, error: _NoProfileError) -> ProfileEr
     if file is None or not file.is_file():
         return error
     data, lines = read_yaml(file)
-    axes = data.get("axes") if isinstance(data, Mapping) else None
-    for k, axis in enumerate(axes if isinstance(axes, list) else ()):
-        if isinstance(axis, Mapping) and axis.get("drive") == name:
-            place = ("axes", k, "drive")
+    for place in lines:
+        if place[-1:] in (("drive",), ("profile",)) and _at(data, place) == name:
             message = f"{place_words(place, data)}, {name!r}: {error.message}"
             return ProfileError(file, message, line_of(lines, place))
     return error
+
+
+def _at(data: Any, place: Location) -> Any:
+    for part in place:
+        data = data[part]
+    return data
 
 
 def packaged(kind: Literal["drives", "machines"]) -> tuple[str, ...]:

@@ -9,6 +9,15 @@ from drives.profile.effects import EffectProfile, MachineEffectProfile
 from drives.profile.values import LocatedError, NotNegative, Number, Part, Positive
 
 
+class FaceProfile(Part):
+    """A kind of drive to simulate, by its files; their paths start from the machine profile's folder."""
+
+    profile: str
+    """Path of the drive profile, or name of a packaged one."""
+    eds: str | None = None
+    """Path of the EDS or DCF file; else the drive profile's."""
+
+
 class SimulatedAxisProfile(Part):
     """The truth about one axis of a simulated machine, SI."""
 
@@ -23,8 +32,9 @@ class SimulatedAxisProfile(Part):
     torque_noise: NotNegative = 0.0
     torque_constant: Positive = 0.1
     """N m/A (or N/A) of the motor, for drives that know currents."""
-    face: str | None = None
-    """Kind of drive that is simulated; else that of the axis' drive profile, or the reference drive."""
+    face: FaceProfile | str | None = None
+    """Kind of drive that is simulated, by its packaged name or by its files; else that of the axis'
+    drive profile, or the reference drive."""
     encoder_counts_per_rev: Annotated[int, Field(ge=16, le=2**30)] = 2**20
     gains: dict[str, Number] = Field(default_factory=dict)
     """Start values of the drive's parameters by name, physical units."""

@@ -40,7 +40,13 @@ from drives.sim.plant import ChainParameters, PlantParameters
 from drives.sim.scales import Scales
 
 if TYPE_CHECKING:
-    from drives.profile import EffectProfile, MachineEffectProfile, MachineProfile
+    from drives.profile import (
+        AxisProfile,
+        EffectProfile,
+        FaceProfile,
+        MachineEffectProfile,
+        MachineProfile,
+    )
 
 Kind = Literal["rotary", "linear"]
 
@@ -270,9 +276,7 @@ def _described(profile: "MachineProfile") -> SimulatedMachine:
                 serial=1000 + axis.node_id if serial is None else serial,
                 gains=truth.gains,
                 torque_constant=truth.torque_constant,
-                face=face_of(truth.face)
-                if truth.face
-                else _face_of_drive(axis.drive, profile.path),
+                face=_face(truth.face, axis, profile.path),
             )
         )
     couplings = tuple(
@@ -280,6 +284,33 @@ def _described(profile: "MachineProfile") -> SimulatedMachine:
     )
     effects = tuple(_machine_effect(part, names) for part in simulation.effects)
     return SimulatedMachine(tuple(drives), couplings, simulation.seed, effects)
+
+
+def _face(told: "FaceProfile | str | None", axis: "AxisProfile", beside: Path) -> Face:
+    if isinstance(told, str):
+        return face_of(told)
+    if told is None:
+        return _face_of_drive(axis.drive, beside)
+    from drives.profile import load_drive
+    from drives.sim.faces.own import own_face
+
+    kind = load_drive(told.profile, beside)
+    eds = kind.eds_path if told.eds is None else beside.parent / told.eds
+    where = f"axis {axis.name}, `face`"
+    if eds is None:
+        raise ValueError(
+            f"{where}: drive profile {kind.name} has no EDS file of its own. Give the drive's as `eds`, "
+            f"beside `profile: {told.profile}`"
+        )
+    if not eds.is_file():
+        raise ValueError(
+            f"{where}: there is no EDS file {eds}. Give its path from the machine profile's folder as "
+            "`eds`"
+        )
+    try:
+        return own_face(kind, eds)
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from None
 
 
 def _face_of_drive(name: str, beside: Path) -> Face:

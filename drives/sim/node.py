@@ -4,7 +4,7 @@ The SDO server, LSS and the dictionary's ground are durand's; PDO, NMT, heartbea
 non-volatile memory and the drive are this package's (the reasons stand in their modules).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Any
 
@@ -13,7 +13,7 @@ from durand.services.nmt import StateEnum
 from durand.services.sdo.server import SDODomainAbort
 
 from drives.sim.abort_codes import Abort
-from drives.sim.dictionary import DriveDictionary, Key, Value
+from drives.sim.dictionary import DriveDictionary, Guard, Key, Value
 from drives.sim.emergency import (
     HEARTBEAT_LOST,
     PDO_TOO_SHORT,
@@ -25,7 +25,7 @@ from drives.sim.faces import REFERENCE, Face
 from drives.sim.faces.face import Loops
 from drives.sim.firmware import SimulatedAxes
 from drives.sim.heartbeat import HeartbeatConsumers, HeartbeatProducer
-from drives.sim.memory import LOAD, SAVE, Bank, NonVolatileMemory
+from drives.sim.memory import LOAD, Bank, NonVolatileMemory
 from drives.sim.motion import MotionControl
 from drives.sim.nmt import NetworkManagement
 from drives.sim.pdo import Getter, PdoService, Setter
@@ -110,6 +110,8 @@ class DriveNode:
             dictionary, scheduler, self._heartbeat_lost, self._heartbeat_back
         )
         self._watched: tuple[int, ...] = ()
+        self._taken_over: dict[Key, Value] = {}
+        """What acts of the objects that wait for a latch."""
         self._latched_getters, self._live_getters = self._make_getters()
         self._setters = self._make_setters()
         self._connect_objects()
@@ -211,6 +213,7 @@ class DriveNode:
         self.nmt.set_state(StateEnum.PRE_OPERATIONAL)
 
     def _apply_parameters(self) -> None:
+        self._take_over(self.face.waiting)
         self._loops_changed()
         for key in LIMIT_KEYS:
             self._write_limit(key, self.dictionary.read(*key))
@@ -244,11 +247,13 @@ class DriveNode:
         for key, bits in self.face.latches.items():
             dictionary.effects[key] = partial(self._latched, key, bits)
         for key in self.face.read_only:
-            dictionary.guards[key] = lambda _: Abort.READ_ONLY
+            self._guard(key, lambda _: Abort.READ_ONLY)
         self._connect_lock()
         dictionary.effects[0x6060, 0] = self.motion.set_mode
         for key in self._loops.locked:
-            dictionary.guards[key] = lambda _: Abort.WRONG_STATE if self.motion.powered else None
+            self._guard(key, lambda _: Abort.WRONG_STATE if self.motion.powered else None)
+        for key in self._loops.keys:
+            self._guard(key, partial(self._refuse_gain, key))
         dictionary.guards[0x1005, 0] = self._refuse_sync
         for key in ((0x1005, 0), (0x1006, 0)):
             dictionary.effects[key] = lambda _: self._changed()
@@ -258,12 +263,13 @@ class DriveNode:
 
     def _connect_memory(self) -> None:
         dictionary = self.dictionary
-        dictionary.guards[0x1010, 1] = lambda v: None if v == SAVE else Abort.CAN_NOT_STORE
+        how = self.face.storing
+        dictionary.guards[how.key] = self._refuse_store
         dictionary.guards[0x1011, 1] = lambda v: None if v == LOAD else Abort.CAN_NOT_STORE
-        dictionary.effects[0x1010, 1] = lambda _: self._begin_store(self._save)
+        dictionary.effects[how.key] = lambda _: self._begin_store(self._save)
         dictionary.effects[0x1011, 1] = lambda _: self._begin_store(self._erase)
-        for index in (0x1010, 0x1011):
-            dictionary.set_read_callback(index, 1, lambda: 1)
+        for key in (how.key, (0x1011, 1)):
+            dictionary.set_read_callback(*key, lambda: 1)
 
     def _make_getters(self) -> tuple[dict[Key, Getter], dict[Key, Getter]]:
         motion, axes, axis = self.motion, self._axes, self.axis
@@ -328,22 +334,56 @@ class DriveNode:
             return
         dictionary = self.dictionary
 
+        def right(password: Value) -> bool:
+            return isinstance(password, bytes) and password.rstrip(b"\0") == lock.password
+
         def give(password: Value) -> None:
-            right = isinstance(password, bytes) and password.rstrip(b"\0") == lock.password
-            dictionary.force(*lock.level_key, int(right))
+            if lock.level_key is not None:
+                dictionary.force(*lock.level_key, int(right(password)))
 
         def closed(_value: Value) -> int | None:
-            return None if dictionary.read(*lock.level_key) else Abort.UNSUPPORTED_ACCESS
+            if lock.level_key is not None:
+                opened = bool(dictionary.read(*lock.level_key))
+            else:
+                opened = right(dictionary.read(*lock.password_key))
+            return None if opened else Abort.UNSUPPORTED_ACCESS
 
         dictionary.effects[lock.password_key] = give
         for key in lock.keys:
-            dictionary.guards[key] = closed
+            self._guard(key, closed)
+
+    def _guard(self, key: Key, guard: Guard) -> None:
+        """Let a guard stand beside those that an object has already."""
+        guards = self.dictionary.guards
+        before = guards.get(key, lambda _: None)
+        guards[key] = lambda value: before(value) or guard(value)
 
     def _latched(self, key: Key, bits: int, value: int) -> None:
         self.dictionary.force(*key, value & ~bits)
+        if value & bits:
+            self._take_over(one for one, latch in self.face.waiting.items() if latch == key)
+            self._loops_changed()
+
+    def _take_over(self, keys: Iterable[Key]) -> None:
+        for key in keys:
+            self._taken_over[key] = self.dictionary.read(*key)
+
+    def _acting(self, index: int, subindex: int) -> Value:
+        """Return the value of an object that the loops work with."""
+        key = (index, subindex)
+        return self._taken_over[key] if key in self._taken_over else self.dictionary.read(*key)
+
+    def _refuse_gain(self, key: Key, value: Value) -> int | None:
+        """Refuse a value with which the loops could not work."""
+        written = self._loops.settings(lambda *one: value if one == key else self._acting(*one))
+        for parameter, wanted in written.items():
+            allowed = self._axes.range_of(parameter)
+            if not allowed.low <= wanted <= allowed.high:
+                return Abort.INVALID_VALUE
+        return None
 
     def _loops_changed(self) -> None:
-        for parameter, value in self._loops.settings(self.dictionary.read).items():
+        for parameter, value in self._loops.settings(self._acting).items():
             if self._axes.get(self.axis, parameter) != value:
                 self._axes.set(self.axis, parameter, value)
 
@@ -425,6 +465,12 @@ class DriveNode:
         if self.nmt.state in (StateEnum.PRE_OPERATIONAL, StateEnum.OPERATIONAL):
             self.network.send(cob_id, data)
 
+    def _refuse_store(self, value: Value) -> int | None:
+        how = self.face.storing
+        if value != how.signature:
+            return Abort.CAN_NOT_STORE
+        return Abort.WRONG_STATE if how.disabled_only and self.motion.powered else None
+
     def _begin_store(self, finish: Callable[[], int | None]) -> None:
         if self.on_store is not None:
             self.on_store()
@@ -434,6 +480,9 @@ class DriveNode:
     def _save(self) -> int | None:
         if self.store_fails is None and not self.store_forgets:
             self.memory.save(self.dictionary)
+        status = self.face.storing.status
+        if status is not None and self.store_fails is None:
+            self.dictionary.force(*status[0], status[1])
         return self.store_fails
 
     def _erase(self) -> int | None:

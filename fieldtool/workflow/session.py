@@ -309,13 +309,16 @@ def resolved(profile: MachineProfile) -> dict[str, Any]:
     """
     data: dict[str, Any] = yaml.safe_load(profile.path.read_text(encoding="utf-8"))
     data["bus"] = profile.bus.as_dict()
-    for axis in data["axes"]:
-        beside = profile.path.parent / str(axis["drive"])
+    simulated = (data.get("simulation") or {}).get("axes", ())
+    faces = [axis["face"] for axis in simulated if isinstance(axis.get("face"), dict)]
+    for part, key in (*((a, "drive") for a in data["axes"]), *((f, "profile") for f in faces)):
+        beside = profile.path.parent / str(part[key])
         if beside.is_file():
-            axis["drive"] = str(beside.resolve())
-        if axis.get("eds"):
-            axis["eds"] = str((profile.path.parent / str(axis["eds"])).resolve())
-        axis.pop("password", None)
+            part[key] = str(beside.resolve())
+    for part in (*data["axes"], *faces):
+        if part.get("eds"):
+            part["eds"] = str((profile.path.parent / str(part["eds"])).resolve())
+        part.pop("password", None)
     return data
 
 

@@ -5,11 +5,12 @@ difference between host and drive.
 """
 
 import re
+from codecs import BOM_UTF8
 from configparser import Error, RawConfigParser
 from pathlib import Path
 
 from durand.datatypes import DatatypeEnum as Type
-from durand.datatypes import is_float, is_numeric
+from durand.datatypes import is_float, is_numeric, range_dict
 
 from drives.sim.entries import Entry, ObjectEntry
 
@@ -36,7 +37,7 @@ class EdsFile:
     def __init__(self, path: Path) -> None:
         self._ini = RawConfigParser(strict=False, comment_prefixes=(";",), delimiters=("=",))
         try:
-            self._ini.read_string(path.read_text(encoding="latin-1"))
+            self._ini.read_string(path.read_bytes().removeprefix(BOM_UTF8).decode("latin-1"))
         except (OSError, Error) as error:
             raise EdsFileError(f"{path}: can not be read as an EDS ({error})") from error
         self.objects: dict[int, ObjectEntry] = {}
@@ -113,7 +114,11 @@ def _value(kind: Type, text: str) -> tuple[int | float | bytes, bool]:
             return float(text), False
         except ValueError:
             return 0.0, False
-    return _whole(text)
+    value, relative = _whole(text)
+    low, high = range_dict[kind]
+    if low < 0 and high < value <= 2 * high + 1:
+        value -= 2 * (high + 1)  # written as the bits of a negative number
+    return min(max(value, low), high), relative
 
 
 def _whole(text: str) -> tuple[int, bool]:

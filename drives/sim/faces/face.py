@@ -9,11 +9,13 @@ What faces do not imitate is said in each of them, and in ``Face.not_imitated``.
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from math import sqrt
 from types import MappingProxyType
 from typing import Protocol
 
 from drives.sim.dictionary import Key, Value
 from drives.sim.entries import OBJECTS, Entry, ObjectEntry
+from drives.sim.memory import SAVE
 from drives.sim.servo_kernel import Parameter
 
 Read = Callable[[int, int], Value]
@@ -93,14 +95,46 @@ def start_settings(gains: Mapping[str, float]) -> dict[Parameter, float]:
     return {known[name]: float(value) for name, value in gains.items()}
 
 
+def pid_of(outer: float, inner: float, reset: float) -> tuple[float, float, float]:
+    """Return P, I and D of one PID that does as a cascade of position P and velocity P and I."""
+    return outer * inner + reset, outer * reset, inner
+
+
+def cascade_of(stiffness: float, windup: float, damping: float) -> dict[Parameter, float]:
+    """Return the cascade with the whole reference velocity fed forward that is this PID."""
+    settings = {Parameter.VELOCITY_FF: 1.0, Parameter.VELOCITY_P: damping}
+    if damping > 0.0:
+        # s^2 - (P/D) s + I/D = 0 has the two corner frequencies of the PID's zeros
+        half = stiffness / damping / 2
+        apart = sqrt(max(0.0, half * half - windup / damping))
+        settings[Parameter.POSITION_P] = half + apart
+        settings[Parameter.VELOCITY_I] = damping * (half - apart)
+    else:
+        settings[Parameter.POSITION_P] = settings[Parameter.VELOCITY_I] = 0.0
+    return settings
+
+
 @dataclass(frozen=True)
 class Lock:
     """A password in front of some objects."""
 
     password_key: Key
-    level_key: Key
+    level_key: Key | None
+    """Object that shows who the drive takes us for; none: it does not tell."""
     password: bytes
     keys: frozenset[Key]
+
+
+@dataclass(frozen=True)
+class Storing:
+    """How the drive is told to store its parameters."""
+
+    key: Key = (0x1010, 1)
+    signature: int = SAVE
+    disabled_only: bool = False
+    """Whether it refuses while its power stage is on."""
+    status: tuple[Key, int] | None = None
+    """Object that shows whether it is done, and its value then."""
 
 
 def _no_values(_motor: Motor) -> dict[Key, Value]:
@@ -136,6 +170,9 @@ class Face:
     """Entries that the drive refuses to have written, whatever its EDS says."""
     latches: Mapping[Key, int] = field(default_factory=lambda: MappingProxyType({}))
     """Objects whose bits act when they are written, and read as 0."""
+    waiting: Mapping[Key, Key] = field(default_factory=lambda: MappingProxyType({}))
+    """Objects whose values act only once a latch is set: that latch."""
+    storing: Storing = Storing()
     fault_after_lost_heartbeat: bool = False
     """A lost heartbeat is a fault whatever 0x6007 says; a fault reset works only after a reset of
     the communication."""

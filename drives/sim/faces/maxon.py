@@ -5,10 +5,16 @@ mean of both position gains acts), the PID's feed-forward of the velocity (0x30A
 units than revolutions a minute, and gains of the PID that no cascade has.
 """
 
-from math import sqrt
-
 from drives.sim.dictionary import Key, Value
-from drives.sim.faces.face import Face, Motor, Read, rpm_units, start_settings
+from drives.sim.faces.face import (
+    Face,
+    Motor,
+    Read,
+    cascade_of,
+    pid_of,
+    rpm_units,
+    start_settings,
+)
 from drives.sim.faces.merge import dressed, shipped
 from drives.sim.servo_kernel import Parameter
 
@@ -56,29 +62,18 @@ class PositionPid(_EposLoops):
             self._gain(p)
             for p in (Parameter.POSITION_P, Parameter.VELOCITY_P, Parameter.VELOCITY_I)
         )
+        pid = pid_of(outer, inner, reset)
         return {
-            _P: self._microamperes(outer * inner + reset),
-            _I: self._microamperes(outer * reset),
-            _D: self._microamperes(inner),
+            **{key: self._microamperes(gain) for key, gain in zip((_P, _I, _D), pid, strict=True)},
             _ACCELERATION: self._microamperes(self._gain(Parameter.INERTIA_FF)),
         }
 
     def settings(self, read: Read) -> dict[Parameter, float]:
         """Return the cascade with the whole reference velocity fed forward that is this PID."""
         stiffness, windup, damping = (_newton_metres(read, key) for key in (_P, _I, _D))
-        settings = dict(self._start)
-        settings[Parameter.VELOCITY_FF] = 1.0
-        settings[Parameter.INERTIA_FF] = _newton_metres(read, _ACCELERATION)
-        settings[Parameter.VELOCITY_P] = damping
-        if damping > 0.0:
-            # s^2 - (P/D) s + I/D = 0 has the two corner frequencies of the PID's zeros
-            half = stiffness / damping / 2
-            apart = sqrt(max(0.0, half * half - windup / damping))
-            settings[Parameter.POSITION_P] = half + apart
-            settings[Parameter.VELOCITY_I] = damping * (half - apart)
-        else:
-            settings[Parameter.POSITION_P] = settings[Parameter.VELOCITY_I] = 0.0
-        return settings
+        inertia = _newton_metres(read, _ACCELERATION)
+        cascade = cascade_of(stiffness, windup, damping)
+        return {**self._start, **cascade, Parameter.INERTIA_FF: inertia}
 
 
 class DualLoop(_EposLoops):

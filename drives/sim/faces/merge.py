@@ -35,7 +35,11 @@ def dressed(path: Path) -> tuple[tuple[ObjectEntry, ...], frozenset[Key]]:
     EdsFileError
         If the file can not be read.
     """
-    file = EdsFile(path)
+    return merged(EdsFile(path))
+
+
+def merged(file: EdsFile) -> tuple[tuple[ObjectEntry, ...], frozenset[Key]]:
+    """Do the same for a file that was read."""
     identity = {
         (0x1018, 1): file.device("VendorNumber"),
         (0x1018, 2): file.device("ProductNumber"),
