@@ -6,11 +6,14 @@ gains that are written have to arrive in the firmware, which converts by the mak
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from drives.api import FloatArray
 from drives.canopen_drive import connect
 from drives.errors import DrivesError, NotSupportedError
 from drives.parameters import back_up, save_backup
+from drives.profile import MachineProfile
 from drives.sim.faces.others import PASSWORD
 from drives.sim.servo_kernel import Parameter
 from fieldtool import workflow
@@ -22,13 +25,14 @@ from tests.faces import machine_of, simulated
 
 pytestmark = pytest.mark.timeout(900)  # a busy computer plans and fits slowly
 PAIRS = {
-    "epos4": ("epos4", "reference"),
+    "epos4": ("epos4", "copley+"),
     "novanta": ("novanta*", "epos4-dual-loop"),
-    "elmo": ("elmo-gold", "nanotec*"),
+    "own": ("own", "nanotec+"),
+    "elmo": ("elmo-gold", "cia402*"),
 }
-"""A star: the packaged profile with its unknown facts filled in.  All kinds, and how each compares
-with the reference drive: benchmark ``faces``."""
-WRITTEN = ("epos4", "novanta")
+"""Kinds of drives as ``tests.faces`` has them.  How each compares with the reference drive: benchmark
+``faces``."""
+WRITTEN = ("epos4", "novanta", "own")
 CLOSE = {"epos4": 1e-3}
 """Relative; a PID with D on the error feeds the reference's velocity forward in steps, and how they are
 sampled is not known but found from the data.  Else 3e-4: rounding and noise."""
@@ -47,7 +51,8 @@ def numbers(model: MachineModel) -> dict[str, float]:
 
 @pytest.fixture(scope="module")
 def sessions(tmp_path_factory):
-    """Each pair's session once, with what its firmware holds before and after a power cycle."""
+    """Each pair's session once, with what its firmware holds before and after a power cycle, and how
+    the machine moves then."""
     done = {}
 
     def session(pair: str):
@@ -61,7 +66,8 @@ def sessions(tmp_path_factory):
                 for node in running.nodes:
                     node.power_cycle()
                 again = [settings(running, k) for k in range(2)]
-            done[pair] = result, held, again
+                path = moved(machine) if pair in WRITTEN else None
+            done[pair] = result, held, again, path
         return done[pair]
 
     return session
@@ -69,6 +75,15 @@ def sessions(tmp_path_factory):
 
 def settings(running, axis: int) -> dict[str, float]:
     return {name: running.axes.get(axis, Parameter[name.upper()]) for name in GAINS}
+
+
+def moved(machine: MachineProfile) -> FloatArray:
+    """Return how far both axes have gone while they follow one path, (n, 2), rad."""
+    with connect(machine) as group, group.motion(0.002) as motion:
+        t = 0.002 * np.arange(1, 501)[:, None]
+        start = motion.position
+        blocks = iter([start + 0.1 * (1 - np.cos(2 * np.pi * np.array([2.0, 3.0]) * t))])
+        return motion.stream(lambda _: next(blocks, None)).position - start
 
 
 @pytest.mark.parametrize("pair", PAIRS)
@@ -82,7 +97,7 @@ def test_what_is_found_is_what_is_there(sessions, pair):
 
 @pytest.mark.parametrize("pair", WRITTEN)
 def test_what_is_written_acts_as_it_was_designed(sessions, pair):
-    result, held, again = sessions(pair)
+    result, held, again, _ = sessions(pair)
     for axis, firmware in zip(result.tuning.axes, held, strict=True):
         designed = {n: v for n, v in axis.parameters.items() if n in GAINS}
         assert set(designed) >= {"position_p", "velocity_p", "velocity_i"}
@@ -92,18 +107,83 @@ def test_what_is_written_acts_as_it_was_designed(sessions, pair):
         assert other == pytest.approx(one, rel=1e-12)  # it survived the power cycle
 
 
+@pytest.mark.parametrize("pair", WRITTEN)
+def test_what_is_read_back_is_what_acts(sessions, pair):
+    """To the last digit of what a drive can hold; a PID's gains are under other names."""
+    result, held, *_ = sessions(pair)
+    by_axis = {"table": held[0], "arm": held[1]}
+    checked = 0
+    for written in result.write_back.written:
+        firmware = by_axis[written.change.axis]
+        if written.change.name in firmware:
+            checked += 1
+            assert firmware[written.change.name] == pytest.approx(written.read_back, rel=1e-6)
+    assert checked >= 3
+
+
+@pytest.mark.parametrize("pair", WRITTEN)
+def test_the_machine_then_moves_as_with_reference_drives(sessions, pair, tmp_path):
+    """The designed gains in two reference drives: the same path but for what a gain is rounded by."""
+    result, _, _, path = sessions(pair)
+    old = {
+        axis.axis: {"velocity_ff": float(kind == "epos4")}
+        for axis, kind in zip(result.tuning.axes, PAIRS[pair], strict=True)
+    }
+    new = {axis.axis: old[axis.axis] | axis.parameters for axis in result.tuning.axes}
+    paths = []
+    for name, start in (("new", new), ("old", old)):
+        folder = tmp_path / name
+        folder.mkdir()
+        machine = machine_of(("reference", "reference"), folder, start)
+        with simulated(machine):
+            paths.append(moved(machine))
+    apart, before = (np.abs(path - other).max(axis=0) for other in paths)
+    print(pair, apart, before)
+    assert (apart < 2e-5).all()  # rad, of 0.2
+    assert (before > 50 * apart).all()
+
+
 def test_gains_that_no_object_holds_are_designed_but_not_written(sessions):
-    result, held, _ = sessions("elmo")
+    result, held, *_ = sessions("elmo")
     assert set(result.tuning.axes[0].parameters) == {"position_p", "velocity_p", "velocity_i"}
     assert not result.write_back.written
     assert any("only through its own language" in w for w in result.warnings)
-    assert held[0]["position_p"] == 15
+    assert [one["position_p"] for one in held] == [15, 15]
+
+
+@pytest.mark.parametrize(
+    ("drive", "why"),
+    [
+        (
+            "elmo-simpliq",
+            "drive profile elmo-simpliq does not know how the drive's gains are written",
+        ),
+        ("cia402*", "drive profile cia402 knows no gains of this drive"),
+        (
+            "copley*",
+            "velocity_p, object 0x60F9:01: drive profile copley does not know in which state",
+        ),
+        ("nanotec*", "drive profile nanotec has no parameter position_p, velocity_i, velocity_p"),
+        ("prbt", "drive profile prbt has no parameter position_p, velocity_i, velocity_p"),
+        ("schunk", "drive profile prbt has no parameter position_p, velocity_i, velocity_p"),
+    ],
+)
+def test_gains_of_a_drive_whose_profile_does_not_tell_are_not_written(tmp_path, drive, why):
+    machine = machine_of((drive, "reference"), tmp_path)
+    gains = {"position_p": 10.0, "velocity_p": 1.0, "velocity_i": 5.0}
+    tuning = Tuning((AxisTuning("table", gains, 1.5, ""),))
+    with simulated(machine) as running:
+        node = running.nodes[0]
+        before = settings(running, 0), node.dictionary.parameters()
+        with connect(machine, to_move=False) as group, pytest.raises(NotSupportedError) as refused:
+            changes_for(group.drives, tuning)
+        assert (settings(running, 0), node.dictionary.parameters()) == before
+    print(refused.value)
+    assert why in str(refused.value)
 
 
 def test_writing_them_is_refused_and_touches_no_drive(tmp_path):
     machine = machine_of(("elmo-gold", "epos4-dual-loop"), tmp_path)
-    from drives.canopen_drive import connect
-
     gains = {"position_p": 10.0, "velocity_p": 1.0, "velocity_i": 5.0}
     tuning = Tuning(tuple(AxisTuning(n, gains, 1.5, "") for n in ("table", "arm")))
     with simulated(machine) as running:

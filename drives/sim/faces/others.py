@@ -52,12 +52,14 @@ def _prbt() -> Face:
 # --- made up from documents ------------------------------------------------------------------------
 
 
-def _variable(index: int, name: str, kind: Type, default: float = 0) -> ObjectEntry:
+def variable(index: int, name: str, kind: Type, default: float = 0) -> ObjectEntry:
+    """Return an object of one entry that can be written."""
     entry = Entry(index, 0, name, kind, "rw", default=default)
     return ObjectEntry(index, name, (entry,), is_variable=True)
 
 
-def _record(index: int, name: str, kinds: dict[int, tuple[str, Type]]) -> ObjectEntry:
+def record(index: int, name: str, kinds: dict[int, tuple[str, Type]]) -> ObjectEntry:
+    """Return an object of several, by sub-index."""
     count = Entry(index, 0, "Highest sub-index", Type.UNSIGNED8, "const", default=max(kinds))
     subs = (Entry(index, k, text, kind, "rw") for k, (text, kind) in kinds.items())
     return ObjectEntry(index, name, (count, *subs))
@@ -114,16 +116,16 @@ def _novanta() -> Face:
     }
     objects, hidden = _made_up(
         (
-            _variable(0x209A, "Rated torque, N m", real),
-            _variable(0x2100, "Rated current, A", real),
-            _variable(0x2500, "Current loop Kp, V/A", real),
-            _variable(0x2501, "Current loop Ki, Hz", real),
-            _variable(0x250A, "Velocity loop Kp, N m/(rev/s)", real),
-            _variable(0x250B, "Velocity loop Ki, Hz", real),
-            _variable(0x250C, "Velocity loop Kd, s", real),
-            _variable(0x2511, "Position loop Kp, (rev/s)/count", real),
-            _variable(0x2590, "Acceleration feed-forward, N m/(rev/s2)", real),
-            *(_record(index, "Biquads", parts) for index in biquads),
+            variable(0x209A, "Rated torque, N m", real),
+            variable(0x2100, "Rated current, A", real),
+            variable(0x2500, "Current loop Kp, V/A", real),
+            variable(0x2501, "Current loop Ki, Hz", real),
+            variable(0x250A, "Velocity loop Kp, N m/(rev/s)", real),
+            variable(0x250B, "Velocity loop Ki, Hz", real),
+            variable(0x250C, "Velocity loop Kd, s", real),
+            variable(0x2511, "Position loop Kp, (rev/s)/count", real),
+            variable(0x2590, "Acceleration feed-forward, N m/(rev/s2)", real),
+            *(record(index, "Biquads", parts) for index in biquads),
         )
     )
 
@@ -143,10 +145,10 @@ def _copley() -> Face:
     position = {1: ("Kp", short), 2: ("Kvff", short), 3: ("Kaff", short), 4: ("Scale", short)}
     objects, hidden = _made_up(
         (
-            _record(0x60F9, "Velocity loop", velocity),
-            _record(0x60FB, "Position loop", position),
-            _variable(0x2106, "Velocity output filter", Type.UNSIGNED32),
-            _variable(0x2108, "Velocity command filter", Type.UNSIGNED32),
+            record(0x60F9, "Velocity loop", velocity),
+            record(0x60FB, "Position loop", position),
+            variable(0x2106, "Velocity output filter", Type.UNSIGNED32),
+            variable(0x2108, "Velocity command filter", Type.UNSIGNED32),
         )
     )
     return Face("copley", FixedLoops, objects, hidden, values=_standard_motor)
@@ -157,8 +159,8 @@ def _nanotec() -> Face:
     closed = {1: ("Position Kp, per mille", Type.UNSIGNED16), 2: ("Tn, us", Type.UNSIGNED32)}
     objects, hidden = _made_up(
         (
-            _record(0x203B, "Motor currents", {1: ("Rated current, mA", Type.UNSIGNED32)}),
-            _record(0x320E, "Closed loop parameters", closed),
+            record(0x203B, "Motor currents", {1: ("Rated current, mA", Type.UNSIGNED32)}),
+            record(0x320E, "Closed loop parameters", closed),
         )
     )
 

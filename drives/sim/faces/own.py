@@ -315,7 +315,7 @@ def _values(told: _Told, motor: Motor) -> dict[Key, Value]:
             wanted.append(("the encoder's revolutions", position.revolutions, 1))
     if isinstance(torque, TorqueScale) and not isinstance(torque.scale, str):
         rated = motor.rated_torque if torque.unit == "N m" else _current(motor)
-        _check_rounding(told, torque, rated)
+        _check_rounding(told, torque, rated, motor.rated_torque)
         wanted.append(("rated_torque", torque.per_mille_of, rated / torque.scale))
         if isinstance(torque.constant, ObjectAddress):
             constant = motor.torque_constant / torque.constant_scale
@@ -339,8 +339,11 @@ def _current(motor: Motor) -> float:
     return motor.rated_torque / motor.torque_constant
 
 
-def _check_rounding(told: _Told, torque: TorqueScale, rated: float) -> None:
-    """Refuse a rated torque that the drive can not hold: all of its torques would be wrong by it."""
+def _check_rounding(told: _Told, torque: TorqueScale, rated: float, given: float) -> None:
+    """Refuse a rated torque that the drive can not hold: all of its torques would be wrong by it.
+
+    ``rated``: what the object holds, N m or A; ``given``: the simulated drive's, N m.
+    """
     units = rated / float(torque.scale)
     if is_float(told.entries[_key(torque.per_mille_of)].type):
         return
@@ -348,7 +351,8 @@ def _check_rounding(told: _Told, torque: TorqueScale, rated: float) -> None:
         raise ValueError(
             f"the rated {'torque' if torque.unit == 'N m' else 'current'} {rated:.6g} {torque.unit} is "
             f"{units:.6g} in object {torque.per_mille_of} of drive profile {told.profile.name}, which "
-            "holds whole numbers. Give the simulated drive a rated_torque that is one"
+            "holds whole numbers. Give a rated_torque that is one there, such as "
+            f"{given * max(1, round(units)) / units:.6g}"
         )
 
 
