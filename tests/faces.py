@@ -54,7 +54,7 @@ COMPLETE: dict[str, dict[str, Any]] = {
     "copley": {
         "velocity": "position units/s",
         "parameters.velocity_p": {"scale": 2e-4, **_ALWAYS},
-        "parameters.velocity_i": {"scale": 5e-3, **_ALWAYS},
+        "parameters.velocity_i": {"scale": 1e-2, **_ALWAYS},
         "parameters.position_p": {"scale": 5e-3, **_DISABLED},
         "parameters.velocity_ff": {"scale": 1e-4, **_DISABLED},
         "store": {"object": "0x1010:01", "timeout": "5 s", "states": "disabled"},

@@ -86,6 +86,20 @@ def moved(machine: MachineProfile) -> FloatArray:
         return motion.stream(lambda _: next(blocks, None)).position - start
 
 
+def by_reference_drives(kinds, tuning: Tuning, folder: Path, *, old: bool = False) -> FloatArray:
+    """Return the same of reference drives with a tuning's gains, or those from before it."""
+    gains = {
+        axis.axis: {"velocity_ff": float(kind.startswith("epos4") and "dual" not in kind)}
+        | ({} if old else axis.parameters)
+        for axis, kind in zip(tuning.axes, kinds, strict=True)
+    }
+    place = folder / f"reference{old}"
+    place.mkdir()
+    machine = machine_of(("reference", "reference"), place, gains)
+    with simulated(machine):
+        return moved(machine)
+
+
 @pytest.mark.parametrize("pair", PAIRS)
 def test_what_is_found_is_what_is_there(sessions, pair):
     result: SessionResult = sessions(pair)[0]
@@ -125,18 +139,8 @@ def test_what_is_read_back_is_what_acts(sessions, pair):
 def test_the_machine_then_moves_as_with_reference_drives(sessions, pair, tmp_path):
     """The designed gains in two reference drives: the same path but for what a gain is rounded by."""
     result, _, _, path = sessions(pair)
-    old = {
-        axis.axis: {"velocity_ff": float(kind == "epos4")}
-        for axis, kind in zip(result.tuning.axes, PAIRS[pair], strict=True)
-    }
-    new = {axis.axis: old[axis.axis] | axis.parameters for axis in result.tuning.axes}
-    paths = []
-    for name, start in (("new", new), ("old", old)):
-        folder = tmp_path / name
-        folder.mkdir()
-        machine = machine_of(("reference", "reference"), folder, start)
-        with simulated(machine):
-            paths.append(moved(machine))
+    kinds = PAIRS[pair]
+    paths = [by_reference_drives(kinds, result.tuning, tmp_path, old=old) for old in (False, True)]
     apart, before = (np.abs(path - other).max(axis=0) for other in paths)
     print(pair, apart, before)
     assert (apart < 2e-5).all()  # rad, of 0.2
