@@ -130,8 +130,7 @@ class CanopenDrive:
         """Yield every object that the EDS calls writable and that is a parameter, not a command.
 
         Objects of the communication profile stay out from 0x1200 to 0x1FFF (SDO and PDO set-up
-        belongs to whoever uses the bus), and so do ``objects.COMMANDS`` and the profile's
-        ``volatile_commands``.
+        belongs to whoever uses the bus), and so do ``objects.COMMANDS`` and the profile's commands.
         """
         for variable in variables(self.dictionary):
             address = ObjectAddress(variable.index, variable.subindex)

@@ -175,8 +175,15 @@ class DriveProfile(Part):
         return frozenset(known)
 
     def is_volatile(self, address: ObjectAddress) -> bool:
-        """Whether an object is among ``volatile_commands``."""
-        return not {address, ObjectAddress(address.index)}.isdisjoint(self.volatile_commands)
+        """Whether an object is among ``volatile_commands``, or stores, unlocks, or shows either."""
+        told: set[ObjectAddress | None] = set()
+        if isinstance(self.store, Store):
+            told |= {self.store.object, self.store.status}
+        if self.unlock is not None:
+            told |= {self.unlock.object, self.unlock.level}
+        return address in told or not {address, ObjectAddress(address.index)}.isdisjoint(
+            self.volatile_commands
+        )
 
     def with_types_of(self, dictionary: ObjectDictionary) -> "DriveProfile":
         """Return the profile with every parameter's type from an EDS file.

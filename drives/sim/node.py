@@ -123,6 +123,7 @@ class DriveNode:
         self._connect_memory()
         self.nmt.state_callbacks.add(self._nmt_changed)
         port.add_subscription(0, self.nmt.handle)
+        self._take_over(face.waiting)
         self._boot()
 
     # -- what others ask of a node ----------------------------------------------------------------
@@ -203,6 +204,7 @@ class DriveNode:
         if whole:
             self.emergency.power_up()
             self.motion.power_up()
+            self._take_over(self.face.waiting)
         self._boot()
         if whole and self.memory.corrupted:
             self.emergency.report(PARAMETERS_LOST, ErrorRegister.DEVICE_PROFILE)
@@ -213,7 +215,6 @@ class DriveNode:
         self.nmt.set_state(StateEnum.PRE_OPERATIONAL)
 
     def _apply_parameters(self) -> None:
-        self._take_over(self.face.waiting)
         self._loops_changed()
         for key in LIMIT_KEYS:
             self._write_limit(key, self.dictionary.read(*key))

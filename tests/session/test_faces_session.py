@@ -4,15 +4,17 @@ Two kinds of drives stand on one bus.  Masses and springs have to be those of th
 gains that are written have to arrive in the firmware, which converts by the makers' own formulas.
 """
 
+from dataclasses import astuple
 from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 from drives.api import FloatArray
 from drives.canopen_drive import connect
 from drives.errors import DrivesError, NotSupportedError
-from drives.parameters import back_up, save_backup
+from drives.parameters import back_up, planned_changes, save_backup
 from drives.profile import MachineProfile
 from drives.sim.faces.others import PASSWORD
 from drives.sim.servo_kernel import Parameter
@@ -36,6 +38,9 @@ WRITTEN = ("epos4", "novanta", "own")
 CLOSE = {"epos4": 1e-3}
 """Relative; a PID with D on the error feeds the reference's velocity forward in steps, and how they are
 sampled is not known but found from the data.  Else 3e-4: rounding and noise."""
+ROUNDED = 5e-5
+"""Rad.  At 3 Hz the axes lag by up to 0.15; half a unit of the coarsest gain is 2e-4 of its value, and
+an encoder's count 6e-6."""
 GAINS = ("position_p", "velocity_p", "velocity_i", "viscous_ff", "inertia_ff")
 
 
@@ -143,8 +148,8 @@ def test_the_machine_then_moves_as_with_reference_drives(sessions, pair, tmp_pat
     paths = [by_reference_drives(kinds, result.tuning, tmp_path, old=old) for old in (False, True)]
     apart, before = (np.abs(path - other).max(axis=0) for other in paths)
     print(pair, apart, before)
-    assert (apart < 2e-5).all()  # rad, of 0.2
-    assert (before > 50 * apart).all()
+    assert (apart < ROUNDED).all()
+    assert (before > 100 * ROUNDED).all()
 
 
 def test_gains_that_no_object_holds_are_designed_but_not_written(sessions):
@@ -252,6 +257,35 @@ def test_what_is_not_known_is_asked_for_in_one_sentence(tmp_path, drive, change,
 def test_profiles_of_the_simulated_machine_stand_beside_it(tmp_path):
     machine = machine_of(("novanta*", "reference"), tmp_path)
     assert Path(machine.axes[0].drive).parent == tmp_path
+
+
+@pytest.mark.parametrize("drive", ["own", "copley+", "nanotec+"])
+def test_a_backup_is_brought_back_and_stored(tmp_path, drive):
+    machine = machine_of((drive, "reference"), tmp_path)
+    path = tmp_path / "parameters-before.yaml"
+    with simulated(machine) as running:
+        node = running.nodes[0]
+        first = settings(running, 0)
+        with connect(machine, to_move=False) as group:
+            group.drives[0].read_scaling()
+            profile = group.drives[0].profile
+            save_backup(back_up(machine.name, group.drives), path)
+            gains = {name: 0.8 * first[name] for name in ("position_p", "velocity_p", "velocity_i")}
+            for change in planned_changes(group.drives[0], gains):
+                node.dictionary.write(*astuple(change.info.address), change.after_raw)
+        for latch in profile.latches:
+            node.dictionary.write(*astuple(latch.object), latch.set_bits)
+        node.memory.save(node.dictionary)
+        node.power_cycle()
+        assert settings(running, 0) == pytest.approx(first | gains, rel=2e-3)
+        workflow.restore(machine.path, path, store=True)
+        assert settings(running, 0) == first
+        node.power_cycle()
+        assert settings(running, 0) == first
+    backup = yaml.safe_load(path.read_text())["drives"][0]["objects"]
+    addresses = {held["object"] for held in backup}
+    assert {str(one.object) for one in profile.parameters.values()} <= addresses
+    assert not addresses & {str(profile.store.object), str(profile.store.status)}
 
 
 def test_gains_behind_a_password_are_backed_up_and_restored(tmp_path):

@@ -56,7 +56,8 @@ def test_files_alone_give_the_face_that_was_written_by_hand(name, constant, coun
         held |= face.values(motor) | loops.factory()
         acting = loops.settings(lambda i, s, held=held: held[i, s])
         found.append({p.name: v for p, v in acting.items()} | {"unit": face.units(motor)[0]})
-        assert (face.latches, face.hidden) == (face_of(name).latches, face_of(name).hidden)
+        for what in ("latches", "hidden", "fault_after_lost_heartbeat"):
+            assert getattr(face, what) == getattr(face_of(name), what)
     own, by_hand = found
     open_in_profile = {"INERTIA_FF": 0.0} if name == "epos4" else {}
     assert own | open_in_profile == pytest.approx(by_hand, rel=1e-9)
@@ -89,6 +90,8 @@ def test_values_act_after_their_latch_and_survive_only_if_they_are_stored(machin
         assert get(0, Parameter.VELOCITY_P) == pytest.approx(1.2)  # it waits
         write(*POSITION_KP, 20 / 2**20)  # another one, which waits for nothing
         assert get(0, Parameter.POSITION_P) == pytest.approx(20.0)
+        assert get(0, Parameter.VELOCITY_P) == pytest.approx(1.2)
+        running.receive(0, bytes((0x82, node.node_id)))  # a reset of the communication is no latch
         assert get(0, Parameter.VELOCITY_P) == pytest.approx(1.2)
         write(*TAKE_OVER, 1)
         assert get(0, Parameter.VELOCITY_P) == pytest.approx(1.8)
@@ -216,6 +219,10 @@ def in_eds(old, new):
             in_profile(parameters__velocity_p__type="INTEGER16"),
             "drive profile own says that object 0x2200:01 (parameters.velocity_p) is INTEGER16, and "
             "own.eds that it is UNSIGNED16. Correct the profile.",
+        ),
+        (
+            in_eds("DataType=0x0008", "DataType=0x0016"),
+            "object 0x2201:00 (parameters.position_p of drive profile own) is no number in own.eds.",
         ),
         (
             in_profile(parameters__velocity_p__scale=2e-6),

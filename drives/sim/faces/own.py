@@ -276,15 +276,15 @@ def _check_objects(told: _Told) -> None:
                 f"drive profile {profile.name} names object {address} ({place}), which {told.eds} does "
                 "not have. Correct the profile, or give the EDS of this drive's firmware"
             )
+        if place != "unlock.object" and not is_numeric(entry.type):
+            raise ValueError(
+                f"object {address} ({place} of drive profile {profile.name}) is no number in "
+                f"{told.eds}. Correct the profile"
+            )
         if kind not in (UNKNOWN, entry.type.name):
             raise ValueError(
                 f"drive profile {profile.name} says that object {address} ({place}) is {kind}, and "
                 f"{told.eds} that it is {entry.type.name}. Correct the profile"
-            )
-        if place.startswith("parameters.") and not is_numeric(entry.type):
-            raise ValueError(
-                f"object {address} ({place} of drive profile {profile.name}) is no number in "
-                f"{told.eds}. Correct the profile"
             )
     for name in {other for one in told.understood.values() for other in one.times}:
         quantity = profile.quantities.get(name)
@@ -327,7 +327,7 @@ def _values(told: _Told, motor: Motor) -> dict[Key, Value]:
     values: dict[Key, Value] = {
         _key(address): told.fitting(place, address, value)
         for place, address, value in wanted
-        if _key(address) in told.entries
+        if (entry := told.entries.get(_key(address))) is not None and is_numeric(entry.type)
     }
     for one in profile.parameters.values():
         if one.only_if is not None and _key(one.only_if.object) in told.entries:
