@@ -102,6 +102,7 @@ def _data(
         if base is not None:
             held = base.model_dump(mode="json", exclude_unset=True)
             held = {k: v for k, v in held.items() if k in KEPT}
+        fed = {"velocity_ff": 1.0} if base is None else {}  # what it has in use, no file tells
         drive = _drive(profile, machine.path, left_out, known=base is not None)
         drives.append(drive)
         axes.append(
@@ -110,7 +111,7 @@ def _data(
                 **held,
                 **_chain(chain, parts, left_out),
                 "torque_noise": float(noise[k]),
-                "gains": {**held.get("gains", {}), **gains[profile.name]},
+                "gains": {**fed, **held.get("gains", {}), **gains[profile.name]},
             }
         )
     data: dict[str, Any] = yaml.safe_load(folder.machine.read_text(encoding="utf-8"))
@@ -222,9 +223,12 @@ def _gains(
         out[info.name] = (
             {}
             if c is None
-            else {"position_p": c.position_p, "velocity_p": c.velocity_p, "velocity_i": c.velocity_i,
-                  "velocity_ff": 1.0}
-        )  # fmt: skip
+            else {
+                "position_p": c.position_p,
+                "velocity_p": c.velocity_p,
+                "velocity_i": c.velocity_i,
+            }
+        )
     if not folder.parameters_before.is_file():
         return out
     try:

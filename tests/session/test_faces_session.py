@@ -17,11 +17,13 @@ from drives.errors import DrivesError, NotSupportedError
 from drives.parameters import back_up, planned_changes, save_backup
 from drives.profile import MachineProfile
 from drives.sim.faces.others import PASSWORD
+from drives.sim.machine import simulated_machine
 from drives.sim.servo_kernel import Parameter
 from fieldtool import workflow
 from fieldtool.design.tuning import AxisTuning, Tuning
 from fieldtool.records.model import MachineModel
 from fieldtool.workflow import Options, SessionResult
+from fieldtool.workflow.twin import twin
 from fieldtool.writeback.transaction import changes_for
 from tests.faces import machine_of, simulated
 
@@ -72,7 +74,7 @@ def sessions(tmp_path_factory):
                     node.power_cycle()
                 again = [settings(running, k) for k in range(2)]
                 path = moved(machine) if pair in WRITTEN else None
-            done[pair] = result, held, again, path
+            done[pair] = result, held, again, path, machine
         return done[pair]
 
     return session
@@ -116,7 +118,7 @@ def test_what_is_found_is_what_is_there(sessions, pair):
 
 @pytest.mark.parametrize("pair", WRITTEN)
 def test_what_is_written_acts_as_it_was_designed(sessions, pair):
-    result, held, again, _ = sessions(pair)
+    result, held, again, *_ = sessions(pair)
     for axis, firmware in zip(result.tuning.axes, held, strict=True):
         designed = {n: v for n, v in axis.parameters.items() if n in GAINS}
         assert set(designed) >= {"position_p", "velocity_p", "velocity_i"}
@@ -143,13 +145,24 @@ def test_what_is_read_back_is_what_acts(sessions, pair):
 @pytest.mark.parametrize("pair", WRITTEN)
 def test_the_machine_then_moves_as_with_reference_drives(sessions, pair, tmp_path):
     """The designed gains in two reference drives: the same path but for what a gain is rounded by."""
-    result, _, _, path = sessions(pair)
+    result, _, _, path, _ = sessions(pair)
     kinds = PAIRS[pair]
     paths = [by_reference_drives(kinds, result.tuning, tmp_path, old=old) for old in (False, True)]
     apart, before = (np.abs(path - other).max(axis=0) for other in paths)
     print(pair, apart, before)
     assert (apart < ROUNDED).all()
     assert (before > 100 * ROUNDED).all()
+
+
+def test_the_machine_of_a_session_simulated_again_has_the_same_drives(sessions, tmp_path):
+    """Their files and gains; without an object for it, as much of the velocity is fed forward."""
+    again = twin(sessions("own")[0].folder, tmp_path / "twin.yaml").profile
+    one, other = simulated_machine(again), simulated_machine(sessions("own")[4])
+    assert [d.face.name for d in one.drives] == ["own", "nanotec"]
+    for drive, first in zip(one.drives, other.drives, strict=True):
+        names = ("position_p", "velocity_p", "velocity_i", "velocity_ff", "velocity_filter")
+        wanted = {name: first.gains[name] for name in names}
+        assert {name: drive.gains[name] for name in names} == pytest.approx(wanted, rel=1e-4)
 
 
 def test_gains_that_no_object_holds_are_designed_but_not_written(sessions):
