@@ -229,6 +229,11 @@ def test_writing_them_is_refused_and_touches_no_drive(tmp_path):
             "velocity, interpolated position. This tool can not measure with it; nothing was moved.",
         ),
         (
+            "schunk",
+            "table: the drive has no mode cyclic position (8); 0x6502 is 0x00000043: profile position, "
+            "velocity, interpolated position. This tool can not measure with it; nothing was moved.",
+        ),
+        (
             "elmo-simpliq",
             "table: the drive has no mode cyclic position (8); 0x6502 is 0x0000006D: profile position, "
             "profile velocity, profile torque, homing, interpolated position. This tool can not measure "
@@ -299,6 +304,31 @@ def test_a_backup_is_brought_back_and_stored(tmp_path, drive):
     addresses = {held["object"] for held in backup}
     assert {str(one.object) for one in profile.parameters.values()} <= addresses
     assert not addresses & {str(profile.store.object), str(profile.store.status)}
+
+
+@pytest.mark.parametrize(
+    ("drive", "name"),
+    [
+        ("elmo-gold", "elmo-gold"),
+        ("elmo-simpliq", "elmo-simpliq"),
+        ("prbt", "prbt"),
+        ("schunk", "prbt"),
+        ("cia402*", "cia402"),
+        ("nanotec*", "nanotec"),
+    ],
+)
+def test_a_drive_that_stores_in_no_known_way_is_not_told_to(tmp_path, drive, name):
+    machine = machine_of((drive, "reference"), tmp_path)
+    path = tmp_path / "parameters-before.yaml"
+    with simulated(machine) as running:
+        with connect(machine, to_move=False) as group:
+            save_backup(back_up(machine.name, group.drives), path)
+        with pytest.raises(NotSupportedError) as refused:
+            workflow.restore(machine.path, path, store=True)
+        assert not any(node.memory.stored for node in running.nodes)
+    assert str(refused.value) == (
+        f"table: profile {name} does not say how this drive stores its parameters; nothing was written."
+    )
 
 
 def test_gains_behind_a_password_are_backed_up_and_restored(tmp_path):

@@ -1,5 +1,6 @@
 """Faces from a user's own files: what they say is what the drive does, and what they lack is told."""
 
+from dataclasses import astuple
 from math import pi
 
 import pytest
@@ -10,14 +11,18 @@ from hypothesis import strategies as st
 
 from drives.canopen_drive import connect
 from drives.errors import ProfileError
+from drives.objects import ObjectAddress
 from drives.profile import load_drive, load_machine
+from drives.profile.eds import info_at, read_eds, variables
 from drives.profile.schema import json_schema
 from drives.sim.faces import Motor, face_of
 from drives.sim.faces.eds_entries import EdsFile
+from drives.sim.faces.merge import shipped
 from drives.sim.faces.others import PASSWORD
 from drives.sim.faces.own import own_face
 from drives.sim.machine import simulated_machine
 from drives.sim.servo_kernel import Parameter
+from fieldtool.workflow.profiling import new_profile
 from fieldtool.workflow.session import resolved
 from tests.faces import machine_of, simulated
 
@@ -61,6 +66,28 @@ def test_files_alone_give_the_face_that_was_written_by_hand(name, constant, coun
     own, by_hand = found
     open_in_profile = {"INERTIA_FF": 0.0} if name == "epos4" else {}
     assert own | open_in_profile == pytest.approx(by_hand, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["elmo-gold.dcf", "elmo-simpliq.dcf", "epos4.eds", "prbt.dcf", "reference.eds", "schunk.dcf"],
+)
+def test_a_first_profile_and_its_eds_already_make_a_drive(name, tmp_path):
+    """All of it answers by SDO, with its own types; what is unknown does nothing."""
+    made = new_profile(shipped(name), tmp_path / "first.yaml")
+    machine_of(("reference", "reference"), tmp_path, table={"drive": made.path.name})
+    in_machine(face={"profile": made.path.name})(tmp_path)
+    machine = load_machine(tmp_path / "machine.yaml")
+    with simulated(machine) as running, connect(machine, to_move=False) as group:
+        drive, node = group.drives[0], running.nodes[0]
+        assert running.axes.get(0, Parameter.VELOCITY_P) == 1.2
+        told = read_eds(shipped(name))
+        objects = [ObjectAddress(v.index, v.subindex) for v in variables(told)]
+        infos = [info_at(told, address) for address in objects]
+        read = [i for i in infos if i and node.face.entries[astuple(i.address)].access != "wo"]
+        for info in read:
+            drive.read(info)
+        assert len(read) > 100
 
 
 # --- what the drive does ---------------------------------------------------------------------------
