@@ -36,5 +36,5 @@ def face_of(name: str) -> Face:
     except KeyError:
         raise ValueError(
             f"no simulated drive looks like {name!r}; there are {', '.join(face_names())}. Give "
-            "`face` in the machine profile's simulation"
+            "one of these as `face` in the machine profile's simulation, or `{profile: FILE, eds: FILE}`"
         ) from None
