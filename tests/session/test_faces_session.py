@@ -102,8 +102,11 @@ def by_reference_drives(kinds, tuning: Tuning, folder: Path, *, old: bool = Fals
     }
     place = folder / f"reference{old}"
     place.mkdir()
+    against = [of.pop("viscous_ff", 0.0) for of in gains.values()]  # no object of theirs holds it
     machine = machine_of(("reference", "reference"), place, gains)
-    with simulated(machine):
+    with simulated(machine) as running:
+        for axis, value in enumerate(against):
+            running.axes.set(axis, Parameter.VISCOUS_FF, value)
         return moved(machine)
 
 

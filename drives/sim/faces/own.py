@@ -196,7 +196,7 @@ class ProfileLoops:
         settings = {Parameter.VELOCITY_FF: 0.0, **self._start}
         if self._told.profile.structure == "pid" and physical.keys() >= set(_PID):
             settings |= cascade_of(*(physical[name] for name in _PID))
-        acting = {name: value for name, value in physical.items() if name in GAIN_NAMES}
+        acting = {n: value for n, value in physical.items() if n in (*GAIN_NAMES, "viscous_ff")}
         return settings | {Parameter[name.upper()]: value for name, value in acting.items()}
 
     def _held(self) -> dict[str, float]:
