@@ -11,6 +11,11 @@ against measurement within 10 % (peak) and 15 % (settling, to 3 cycles).  The tr
 for what was written stand beside.  Left out: criticism, report and pictures, which take their time and
 change nothing here.
 
+With ``--hidden`` each machine has one effect beyond its prior model as well, drawn from the seed
+(:func:`hide`), and criticism is on: the design rests on the model that it extends.  The machines are the
+same otherwise.  The table then says what was hidden, what criticism named, and of what was not kept
+whether the drives hold their old gains.
+
 Rows are appended to a file (``--out``), so that pieces add up: the same seed goes on where it ended.
 """
 
@@ -21,7 +26,10 @@ import re
 import shutil
 import tempfile
 import time
+import traceback
+from collections.abc import Mapping
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -31,9 +39,12 @@ import yaml
 
 from drives.errors import DrivesError
 from drives.profile import MachineProfile, load_machine
+from drives.sim.firmware import Parameter
 from drives.sim.lockstep_bus import register, unregister
 from drives.sim.machine import simulated_machine
+from drives.sim.running import RunningMachine
 from fieldtool import workflow
+from fieldtool.cli.main import exit_code
 from fieldtool.design.machine import machine_of
 from fieldtool.design.predict import predict
 from fieldtool.design.rule import rule
@@ -125,6 +136,60 @@ def random_machine(rng: np.random.Generator) -> dict[str, Any]:
     }
 
 
+def hide(data: dict[str, Any], rng: np.random.Generator) -> dict[str, Any]:
+    """Give one axis of a machine an effect that no prior model has; return it as in ``model.yaml``."""
+    count = len(data["simulation"]["axes"])
+    elastic = [k for k in range(count) if data["simulation"]["axes"][k]["springs"]]
+    name = str(rng.choice(list(PARTS if elastic else ON_ONE_MASS)))
+    k = int(rng.choice(range(count) if name in ON_ONE_MASS else elastic))
+    truth = data["simulation"]["axes"][k]
+    location, numbers = PARTS[name](truth, rng)
+    place = {"joint": int(location.split()[1])} if "spring" in location else {}
+    if name in ("coulomb_friction", "extra_mode"):
+        place = {"location": location}
+    truth["effects"] = [{"effect": name, **place, **numbers}]
+    axis = data["axes"][k]["name"]
+    return {"effect": name, "axis": axis, "location": location, "parameters": numbers}
+
+
+def _between(rng: np.random.Generator, low: float, high: float) -> float:
+    return float(np.exp(rng.uniform(np.log(low), np.log(high))))
+
+
+def _spring(truth: Mapping[str, Any], rng: np.random.Generator) -> str:
+    return f"spring {rng.integers(1, len(truth['masses']))}"
+
+
+PARTS: Mapping[str, Any] = {
+    "coulomb_friction": lambda t, r: (
+        "motor",
+        {"torque": t["rated_torque"] * _between(r, 0.01, 0.08)},
+    ),
+    "extra_mode": lambda t, r: (
+        "load",
+        {
+            "mass": t["masses"][-1] * _between(r, 0.1, 0.5),
+            "frequency": _between(r, 6.0, 40.0),
+            "damping_ratio": _between(r, 0.005, 0.03),
+        },
+    ),
+    "structural_damping": lambda t, r: (_spring(t, r), {"loss_factor": _between(r, 0.02, 0.15)}),
+    "backlash": lambda t, r: (_spring(t, r), {"gap": _between(r, 3e-4, 3e-3)}),
+    "cogging": lambda t, r: (
+        "motor",
+        {
+            "amplitude": t["rated_torque"] * _between(r, 0.003, 0.03),
+            "periods": float(r.choice([8, 12, 16, 18, 24])),
+            "phase": float(r.uniform(0, 2 * np.pi)),
+        },
+    ),
+}
+"""Place and numbers of what may be hidden, from the truth of its axis: dry friction of 1 to 8 % of the
+rated torque, a mass of 0.1 to 0.5 of the last one on a spring of its own (6 to 40 Hz with the other end
+held), play of 1 to 10 arc minutes, magnets of 0.3 to 3 % of the rated torque."""
+ON_ONE_MASS = ("coulomb_friction", "extra_mode", "cogging")
+
+
 def with_old_gains(data: dict[str, Any], folder: Path) -> tuple[MachineProfile, bool]:
     """Put the rule's gains for the old tooling into the drives; return whether they are stable now."""
     path = folder / "machine.yaml"
@@ -147,19 +212,23 @@ def with_old_gains(data: dict[str, Any], folder: Path) -> tuple[MachineProfile, 
     return machine, ClosedLoop(truth, tuple(loops)).stable
 
 
-def tried(seed: int, number: int, keep: Path | None = None) -> dict[str, Any]:
+def tried(
+    seed: int, number: int, keep: Path | None = None, *, hidden: bool = False
+) -> dict[str, Any]:
     """Take one machine the whole way; return what came of it, plain values.
 
-    ``keep`` is where its session folder stays, for looking at it.
+    ``keep`` is where its session folder stays, for looking at it; ``hidden``: one effect is hidden in
+    the machine, and criticism is on.
     """
-    rng = np.random.default_rng([seed, number])
+    data = random_machine(np.random.default_rng([seed, number]))
+    effect = hide(data, np.random.default_rng([seed, number, 1])) if hidden else None
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         if keep is not None:
             folder = keep / f"{seed}-{number}"
             folder.mkdir(parents=True, exist_ok=True)
         os.environ["FIELDTOOL_STATE_DIR"] = str(folder / "notes")
-        machine, stable_before = with_old_gains(random_machine(rng), folder)
+        machine, stable_before = with_old_gains(data, folder)
         row: dict[str, Any] = {
             "seed": seed,
             "number": number,
@@ -167,6 +236,7 @@ def tried(seed: int, number: int, keep: Path | None = None) -> dict[str, Any]:
             "old_stable": stable_before,
         }
         running = register(CHANNEL, simulated_machine(machine))
+        gains = _gains(running)
         plans: list[Any] = []
         planned = Verification.plan
 
@@ -177,8 +247,10 @@ def tried(seed: int, number: int, keep: Path | None = None) -> dict[str, Any]:
         begun = time.perf_counter()
         try:
             with ExitStack() as stack:
+                uncriticised = ("fieldtool.workflow.stages.criticised", _uncriticised)
                 for target, new in (
-                    ("fieldtool.workflow.stages.criticised", _uncriticised),
+                    *(() if hidden else (uncriticised,)),
+                    ("fieldtool.workflow.criticising.draw_criticism", lambda *_: None),
                     ("fieldtool.workflow.stages._reported", lambda *_: None),
                     ("fieldtool.workflow.stages.report", lambda *_: None),
                     ("fieldtool.workflow.stages.draw_responses", lambda *_: None),
@@ -192,6 +264,11 @@ def tried(seed: int, number: int, keep: Path | None = None) -> dict[str, Any]:
         except (DrivesError, FieldtoolError) as error:
             row["outcome"] = type(error).__name__
             row["said"] = str(error)
+            row["code"] = exit_code(error)
+        except Exception as error:  # a defect, of one machine of many
+            row["outcome"] = type(error).__name__
+            row["said"] = traceback.format_exc()
+            row["code"] = exit_code(error)
         finally:
             row["powered"] = [n.node_id for n in running.nodes if n.motion.powered]
             unregister(CHANNEL)
@@ -199,9 +276,30 @@ def tried(seed: int, number: int, keep: Path | None = None) -> dict[str, Any]:
         found = folder / "session" / "verification.yaml"
         if found.is_file():
             row["verification"] = yaml.safe_load(found.read_text())
+        truth = truth_model(machine)
+        if effect is not None and truth is not None:
+            row |= {"hidden": effect, "as_before": gains == _gains(running)}
+            row["criticism"] = _criticism(folder / "session" / "criticism.yaml")
+            truth = replace(truth, effects=(effect,))
         if plans:
-            row["true"] = _true_figures(truth_model(machine), plans[-1])
+            row["true"] = _true_figures(truth, plans[-1])
     return row
+
+
+def _gains(running: RunningMachine) -> list[float]:
+    """Every parameter of every drive as its firmware has it."""
+    return [running.axes.get(n.axis, name) for n in running.nodes for name in Parameter]
+
+
+def _criticism(path: Path) -> dict[str, Any] | None:
+    """Verdict and causes of a session's criticism; None where it was not made."""
+    if not path.is_file():
+        return None
+    found = yaml.safe_load(path.read_text())
+    causes = [
+        {k: c[k] for k in ("effect", "axis", "location", "parameters")} for c in found["causes"]
+    ]
+    return {"verdict": found["verdict"], "causes": causes}
 
 
 def _run(machine: MachineProfile, folder: Path) -> workflow.SessionResult:
@@ -249,9 +347,17 @@ def _judged(rows: list[dict[str, Any]]) -> None:
         outcomes[row["outcome"]] = outcomes.get(row["outcome"], 0) + 1
     print(f"{len(rows)} machines: {outcomes}")
     for row in rows:
+        if "hidden" in row:
+            print(f"  {row['number']}: {_named(row)}")
         if row["outcome"] != "kept":
             stable = "" if row["old_stable"] else " (old gains are not stable with the new tooling)"
-            print(f"  {row['number']}{stable}: {row['outcome']}: {row.get('said', '')[:230]}")
+            said = row.get("said", "")
+            if "hidden" in row:
+                held = "old gains held" if row["as_before"] else "GAINS ARE NOT THE OLD ONES"
+                said = f"exit code {row['code']}, {held}: {said}"
+            else:
+                said = said[:230]
+            print(f"  {row['number']}{stable}: {row['outcome']}: {said}")
     kept = [row for row in rows if row["outcome"] == "kept"]
     axes = [
         (one, true, row["verification"]["cycle"])
@@ -311,6 +417,24 @@ def _judged(rows: list[dict[str, Any]]) -> None:
     print(f"seconds a machine: median {np.median([row['seconds'] for row in rows]):.0f}")
 
 
+def _named(row: Mapping[str, Any]) -> str:
+    """What was hidden, and what criticism said of the machine."""
+    found = row["criticism"]
+    if found is None:
+        return f"{_effect(row['hidden'])}; not criticised"
+    causes = ", ".join(_effect(cause) for cause in found["causes"])
+    return f"{_effect(row['hidden'])}; {found['verdict']}: {causes or 'no cause'}"
+
+
+def _effect(effect: Mapping[str, Any]) -> str:
+    numbers = {
+        name: one["value"] if isinstance(one, Mapping) else one
+        for name, one in effect["parameters"].items()
+    }
+    words = " ".join(f"{name} {value:.3g}" for name, value in numbers.items())
+    return f"{effect['effect']} of {effect['axis']} ({effect['location']}) {words}"
+
+
 def _pairs(axes: list[Any], which: str, name: str) -> list[float]:
     """One figure of every axis; what is infinite or missing counts as such."""
     values = [(one[which] or {}).get(name) for one, _, _ in axes]
@@ -325,6 +449,9 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="JSON lines, appended; default: none kept")
     parser.add_argument("--only", type=int, nargs="*", help="numbers of these machines alone")
     parser.add_argument("--keep", type=Path, help="keep session folders here")
+    parser.add_argument(
+        "--hidden", action="store_true", help="hide an effect in each machine, and criticise"
+    )
     parser.add_argument("--seconds", type=float, default=1e9, help="begin no machine after these")
     arguments = parser.parse_args()
     seed = arguments.seed
@@ -333,13 +460,14 @@ def main() -> None:
     rows: list[dict[str, Any]] = []
     if arguments.out and arguments.out.is_file():
         rows = [json.loads(line) for line in arguments.out.read_text().splitlines()]
+    rows = [row for row in rows if ("hidden" in row) == arguments.hidden]
     done = {row["number"] for row in rows if row["seed"] == seed}
     print(f"seed {seed}, {len(done)} machines done before", flush=True)
     begun = time.perf_counter()
     for number in arguments.only or range(arguments.count):
         if number in done or time.perf_counter() - begun > arguments.seconds:
             continue
-        row = tried(seed, number, arguments.keep)
+        row = tried(seed, number, arguments.keep, hidden=arguments.hidden)
         rows.append(row)
         print(f"  {number}: axes {row['axes']} {row['outcome']} {row['seconds']:.0f} s", flush=True)
         if arguments.out:
