@@ -14,7 +14,7 @@ change nothing here.
 With ``--hidden`` each machine has one effect beyond its prior model as well, drawn from the seed
 (:func:`hide`), and criticism is on: the design rests on the model that it extends.  The machines are the
 same otherwise.  The table then says what was hidden, what criticism named, and of what was not kept
-whether the drives hold their old gains.
+whether the drives hold their old parameters.
 
 Rows are appended to a file (``--out``), so that pieces add up: the same seed goes on where it ended.
 """
@@ -39,7 +39,7 @@ import yaml
 
 from drives.errors import DrivesError
 from drives.profile import MachineProfile, load_machine
-from drives.sim.firmware import Parameter
+from drives.sim.entries import ENTRIES
 from drives.sim.lockstep_bus import register, unregister
 from drives.sim.machine import simulated_machine
 from drives.sim.running import RunningMachine
@@ -180,13 +180,14 @@ PARTS: Mapping[str, Any] = {
         {
             "amplitude": t["rated_torque"] * _between(r, 0.003, 0.03),
             "periods": float(r.choice([8, 12, 16, 18, 24])),
-            "phase": float(r.uniform(0, 2 * np.pi)),
+            "phase": np.pi,
         },
     ),
 }
 """Place and numbers of what may be hidden, from the truth of its axis: dry friction of 1 to 8 % of the
 rated torque, a mass of 0.1 to 0.5 of the last one on a spring of its own (6 to 40 Hz with the other end
-held), play of 1 to 10 arc minutes, magnets of 0.3 to 3 % of the rated torque."""
+held), play of 1 to 10 arc minutes, magnets of 0.3 to 3 % of the rated torque, in one of whose detents it
+rests."""
 ON_ONE_MASS = ("coulomb_friction", "extra_mode", "cogging")
 
 
@@ -236,7 +237,7 @@ def tried(
             "old_stable": stable_before,
         }
         running = register(CHANNEL, simulated_machine(machine))
-        gains = _gains(running)
+        before = _held(running)
         plans: list[Any] = []
         planned = Verification.plan
 
@@ -278,7 +279,7 @@ def tried(
             row["verification"] = yaml.safe_load(found.read_text())
         truth = truth_model(machine)
         if effect is not None and truth is not None:
-            row |= {"hidden": effect, "as_before": gains == _gains(running)}
+            row |= {"hidden": effect, "as_before": before == _held(running)}
             row["criticism"] = _criticism(folder / "session" / "criticism.yaml")
             truth = replace(truth, effects=(effect,))
         if plans:
@@ -286,9 +287,14 @@ def tried(
     return row
 
 
-def _gains(running: RunningMachine) -> list[float]:
-    """Every parameter of every drive as its firmware has it."""
-    return [running.axes.get(n.axis, name) for n in running.nodes for name in Parameter]
+def _held(running: RunningMachine) -> list[Any]:
+    """Every parameter of the maker's that a drive holds, as it is on the bus."""
+    own = [
+        entry.key
+        for entry in ENTRIES.values()
+        if entry.is_parameter and 0x2000 <= entry.index < 0x6000
+    ]
+    return [node.dictionary.read(*key) for node in running.nodes for key in own]
 
 
 def _criticism(path: Path) -> dict[str, Any] | None:
@@ -353,7 +359,9 @@ def _judged(rows: list[dict[str, Any]]) -> None:
             stable = "" if row["old_stable"] else " (old gains are not stable with the new tooling)"
             said = row.get("said", "")
             if "hidden" in row:
-                held = "old gains held" if row["as_before"] else "GAINS ARE NOT THE OLD ONES"
+                held = (
+                    "old parameters held" if row["as_before"] else "PARAMETERS ARE NOT THE OLD ONES"
+                )
                 said = f"exit code {row['code']}, {held}: {said}"
             else:
                 said = said[:230]
