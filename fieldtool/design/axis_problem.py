@@ -103,6 +103,7 @@ class AxisProblem:
         if isfinite(self.bounds.compliance):
             soft = float(np.abs(self._plant * inverse).max())
             excess = max(excess, SOFT * (soft / self.bounds.compliance - 1))
+            excess = max(excess, soft / self.bounds.softest - 1)
         if self._far.any():
             far = np.abs(1 - inverse[self._far])
             excess = max(excess, float(far.max()) / self.bounds.far - 1)

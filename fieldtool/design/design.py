@@ -106,6 +106,8 @@ class Task:
     found: list[Best] = field(default_factory=list)
     does: list[Does] = field(default_factory=list)
     """What each axis' loop does already."""
+    softest: dict[int, float] = field(default_factory=dict)
+    """Largest compliance of axes that are to be as stiff as they are, rad/(N m) or m/N."""
 
     @property
     def servos(self) -> tuple[Servo, ...]:
@@ -147,6 +149,7 @@ class Task:
             side.resolution,
             self.top,
             does.compliance,
+            self.softest.get(axis, inf),
             max(FAR_GAIN, does.far),
             tuple(2 * np.pi * width for width in widths),
         )

@@ -35,7 +35,9 @@ class Bounds:
     top: float
     """rad/s: highest frequency that the model was measured at."""
     compliance: float = np.inf
-    """Largest motor position per torque at the motor, rad/(N m) or m/N."""
+    """Largest motor position per torque at the motor, rad/(N m) or m/N: a wish."""
+    softest: float = np.inf
+    """The same, but to be kept."""
     far: float = FAR_GAIN
     """Largest gain of the closed loop beyond ``top``."""
     bandwidths: tuple[float, ...] = ()

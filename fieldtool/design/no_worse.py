@@ -1,6 +1,7 @@
 """New parameters against those that the drives have: an axis that would be worse keeps its own.
 
-Worse is slower, and softer where nothing that was asked for takes stiffness.  A motor that strays more
+Worse is slower, and softer where nothing that was asked for takes stiffness: an axis that is no more
+than softer is designed anew first, with its stiffness as a bound.  A motor that strays more
 from its reference is told (:mod:`fieldtool.design.given_up`): that is how the last mass arrives early.
 """
 
@@ -8,7 +9,7 @@ from math import inf
 
 import numpy as np
 
-from fieldtool.design.design import Task, improved
+from fieldtool.design.design import INSIDE, Task, improved
 from fieldtool.design.held import held
 from fieldtool.design.machine import machine_of
 from fieldtool.design.predict import AxisPrediction, Prediction, predict
@@ -61,6 +62,7 @@ def no_worse(
     # no response asks to give up stiffness, and no machine that the model allows
     firm = not task.softens and task.holds(present, every)
     stiff = [firm and peak <= SLACK * task.bound for peak in peaks]
+    chosen, kept = _firmer(task, chosen, old, (good, stiff), kept)
     while worse := _worse_axes(task, chosen, old, (good, stiff), kept):
         kept |= worse
         mixed = tuple(present[k] if k in kept else one for k, one in enumerate(chosen))
@@ -72,6 +74,31 @@ def no_worse(
             raise _worse(task, chosen, old, min(worse))
         chosen = mixed
     return chosen, kept
+
+
+def _firmer(
+    task: Task,
+    chosen: tuple[Servo, ...],
+    old: Prediction,
+    which: tuple[list[bool], list[bool]],
+    kept: frozenset[int],
+) -> tuple[tuple[Servo, ...], frozenset[int]]:
+    """Design axes anew that are worse for being softer alone; unchanged where that does not help."""
+    good, stiff = which
+    worse = _worse_axes(task, chosen, old, which, kept)
+    soft = worse - _worse_axes(task, chosen, old, (good, [False] * len(stiff)), kept)
+    if not soft:
+        return chosen, kept
+    task.softest = {k: INSIDE * SOFTER * old.axes[k].compliance for k in soft}
+    task.take(chosen)
+    for axis in sorted(soft):
+        improved(task, axis)
+    try:
+        firmer, same = held(task, kept)
+    except DesignError:
+        return chosen, kept
+    better = _worse_axes(task, firmer, old, which, same) < worse
+    return (firmer, same) if better else (chosen, kept)
 
 
 def _round_these(

@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 
 from fieldtool.design.decide import design
-from fieldtool.design.design import Task
+from fieldtool.design.design import Does, Task
 from fieldtool.design.drive_side import DriveSide
 from fieldtool.design.figures import STRAYS, strays
 from fieldtool.design.given_up import given_up, no_sooner
 from fieldtool.design.machine import machine_of
 from fieldtool.design.moves import typical_move
-from fieldtool.design.no_worse import SOFTER, TICK, arrival, no_worse, predicted
+from fieldtool.design.no_worse import SOFTER, TICK, arrival, no_worse, predicted, softer_than
 from fieldtool.design.predict import AxisPrediction
 from fieldtool.design.servo import Servo, Timing
-from fieldtool.design.start import slower
+from fieldtool.design.start import plain_start, slower
 from fieldtool.design.tuning import as_parameters
 from fieldtool.records.closed_loop import AxisLoop
 from fieldtool.records.model import AxisModel, Estimate, MachineModel
@@ -34,6 +34,8 @@ def task_of(kind: str = "rotary", bound: float = 1.7) -> Task:
     rng = np.random.default_rng(1)
     task = Task(model, (side,), (move,), bound, 1e3, [machine_of(model)], rng, lambda *_: None)
     task.most = 2.0
+    task.plain = plain_start(model, task.sides, task.machines, task.top)
+    task.does = [Does()]
     return task
 
 
@@ -44,12 +46,46 @@ def both(task: Task, new: Servo) -> tuple[AxisPrediction, AxisPrediction]:
     return now, was
 
 
-def test_an_axis_that_would_be_softer_for_nothing_keeps_its_own() -> None:
+def test_an_axis_that_would_be_softer_for_nothing_keeps_its_own(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("fieldtool.design.no_worse.improved", lambda *_: None)
     task = task_of()
     new, was = both(task, SOFT)
     assert new.compliance > SOFTER * was.compliance
     assert no_worse(task, (SOFT,)) == ((PRESENT,), {0})
     assert no_worse(task, (slower(PRESENT, 0.95),)) == ((slower(PRESENT, 0.95),), frozenset())
+
+
+def test_an_axis_that_would_be_softer_is_designed_anew_as_stiff_as_it_is_now() -> None:
+    task = task_of()
+    (one,), kept = no_worse(task, (SOFT,))
+    assert (one != PRESENT, kept) == (True, frozenset())
+    new, was = (predicted(task, (each,), spread=False).axes[0] for each in (one, PRESENT))
+    assert new.compliance <= SOFTER * was.compliance
+    assert new.margins.sensitivity_peak <= 1.7
+
+
+def test_a_load_that_swings_settles_sooner_though_stiffness_is_kept() -> None:
+    """The quickest arrival takes a motor that gives way; one a little stiffer is nearly as quick."""
+    chain = AxisModel(
+        "x",
+        "rotary",
+        (Estimate(1.5, 0.0), Estimate(3.1, 0.0)),
+        (Estimate(1850.0, 0.0),),
+        (Estimate(2.7, 0.0),),
+        Estimate(2.3, 0.0),
+    )
+    present = as_parameters(Servo(AxisLoop(10.0, 114.0, 1050.0, 1.0)))
+    side = DriveSide("x", None, Timing(0.2e-3, 0.1e-3, 1e-3), 230.0, 6e-6, {}, present)
+    move = typical_move("x", (-2.0, 2.0), 6.0, 50.0, 230.0, 4.6)
+    model = MachineModel((chain,))
+    soft, normal = (design(model, [side], [move], response=name) for name in ("soft", "normal"))
+    assert normal.present is not None
+    [was], [new] = normal.present.axes, normal.prediction.axes
+    assert softer_than(soft.prediction.axes[0], was), "what would be refused as too soft"
+    assert not softer_than(new, was)
+    assert arrival(new) < 0.6 * arrival(was)
 
 
 def test_a_soft_response_and_a_margin_that_is_asked_for_may_take_stiffness() -> None:
