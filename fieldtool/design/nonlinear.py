@@ -7,6 +7,9 @@ from fieldtool.design.machine import DRY, number
 from fieldtool.design.servo import Servo
 from fieldtool.records.model import MachineModel
 
+PULLS = {"cogging": "amplitude", "gravity": "torque"}
+"""Largest torque or force, by its name, of what changes with the position."""
+
 
 def notes_of(model: MachineModel, servos: Sequence[Servo]) -> list[str]:
     """Return what the model's effects mean for the designed loops, a sentence each.
@@ -25,6 +28,9 @@ def notes_of(model: MachineModel, servos: Sequence[Servo]) -> list[str]:
         unit, torque_unit = ("rad", "N m") if rotary else ("m", "N")
         if kind in DRY:
             notes += _friction(name, effect, servo, unit, torque_unit)
+        elif kind in PULLS and (rotary or kind != "gravity"):
+            size = abs(number(effect, PULLS[kind]))
+            notes.append(_pull(name, f"{kind} of {size:.3g} {torque_unit}", size, servo, unit))
         elif kind == "backlash":
             gap = number(effect, "gap") or 2 * number(effect, "half_gap")
             notes.append(
@@ -52,8 +58,7 @@ def _friction(
     )
     if torque <= 0:
         return []
-    stiffness = loop.velocity_p * loop.position_p + loop.velocity_i
-    away = torque / stiffness
+    away = _away(servo, torque)
     if loop.velocity_i <= 0:
         return [f"{name}: dry friction may hold the motor up to {away:.3g} {unit} off its target."]
     return [
@@ -61,3 +66,21 @@ def _friction(
         f"off its target for about {loop.velocity_p / loop.velocity_i:.2g} s, and then let it creep or "
         "hunt; what is predicted of moves has it in."
     ]
+
+
+def _pull(name: str, what: str, size: float, servo: Servo, unit: str) -> str:
+    loop = servo.loop
+    time = ""
+    if loop.velocity_i > 0:
+        time = f" for about {loop.velocity_p / loop.velocity_i:.2g} s after a move"
+    return (
+        f"{name}: {what} may pull the motor up to {_away(servo, size):.3g} {unit} off its target{time}; "
+        "what is predicted of moves does not have it. Where that is too far, stiffer parameters hold "
+        "it: --response stiff, or the present ones."
+    )
+
+
+def _away(servo: Servo, torque: float) -> float:
+    """Return how far a slow torque moves the motor before the integral takes it back."""
+    loop = servo.loop
+    return torque / (loop.velocity_p * loop.position_p + loop.velocity_i)
