@@ -264,7 +264,9 @@ def tried(
             row["time"] = result.machine_time
         except (DrivesError, FieldtoolError) as error:
             row["outcome"] = type(error).__name__
-            row["said"] = str(error)
+            row["said"] = " ".join(
+                [str(error), *(getattr(error, "__notes__", ()) if hidden else ())]
+            )
             row["code"] = exit_code(error)
         except Exception as error:  # a defect, of one machine of many
             row["outcome"] = type(error).__name__
@@ -294,7 +296,8 @@ def _held(running: RunningMachine) -> list[Any]:
         for entry in ENTRIES.values()
         if entry.is_parameter and 0x2000 <= entry.index < 0x6000
     ]
-    return [node.dictionary.read(*key) for node in running.nodes for key in own]
+    values = [node.dictionary.read(*key) for node in running.nodes for key in own]
+    return [np.float32(one) if isinstance(one, float) else one for one in values]
 
 
 def _criticism(path: Path) -> dict[str, Any] | None:
