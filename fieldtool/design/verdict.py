@@ -158,7 +158,7 @@ def faults(
     before, after = one.before, one.after
     if after is None:
         return (f"{one.axis}: was not measured with the new parameters",)
-    found = _unmeasured(after, "new") + _margins(one, after, bound, believed)
+    found = _unmeasured(after, "new") + _margins(one, after, bound, believed, softer)
     if before is None:
         found.append(
             "was not measured with the old parameters, so nothing says that it is no worse"
@@ -199,7 +199,9 @@ def _unmeasured(figures: AxisFigures, whose: str, *, sensitivity: bool = True) -
     ]
 
 
-def _margins(one: Comparison, after: AxisFigures, bound: float, believed: bool) -> list[str]:
+def _margins(
+    one: Comparison, after: AxisFigures, bound: float, believed: bool, softer: bool
+) -> list[str]:
     found = []
     if believed and one.rubs and one.predicted and one.predicted.sensitivity_peak:
         # what friction adds, as predicted, is no want of the loop's; never beyond what any loop may have
@@ -213,6 +215,7 @@ def _margins(one: Comparison, after: AxisFigures, bound: float, believed: bool) 
         found.append(
             f"its peak of sensitivity is {peak:.3g} at {after.sensitivity_frequency:.3g} Hz, "
             f"{bound:.3g} was wanted and up to {MARGIN * bound:.3g} is taken"
+            + ("" if softer else " (a design with --response soft keeps more margin)")
         )
     return found
 

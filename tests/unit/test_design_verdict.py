@@ -193,3 +193,12 @@ def test_the_picture_has_the_bound_that_was_designed_for(monkeypatch, tmp_path):
     levels = {line.get_label(): line.get_ydata()[0] for line in sensitivity.lines}
     assert levels["1.4 (2.9 dB)"] == 1.4
     assert "2 (6 dB)" not in levels
+
+
+@pytest.mark.parametrize("softer", [True, False])
+def test_a_peak_above_the_bound_says_what_keeps_more_margin(softer):
+    expected, after = (replace(GOOD, sensitivity_peak=peak) for peak in (1.63, 1.83))
+    one = Comparison("x", "rad", 1.0, 0.5, 0.01, GOOD, expected, after)
+    [fault] = faults(one, 0.001, 1.7, believed=True, softer=softer)
+    assert "1.7 was wanted and up to 1.78 is taken" in fault
+    assert ("--response soft" in fault) == (not softer), "nothing is softer than soft"
