@@ -163,10 +163,10 @@ def written(
 
 @contextmanager
 def _before_the_write() -> Iterator[None]:
-    """Have whatever stops the work here say that nothing was written."""
+    """Have whatever stops the work here, or refuses to go on, say that nothing was written."""
     try:
         yield
-    except StoppedError as error:
+    except (StoppedError, PlanRefusedError) as error:
         if not isinstance(error, OscillationError):  # which says so
             error.add_note("That was before the write: nothing was written.")
         raise

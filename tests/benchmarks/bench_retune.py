@@ -180,7 +180,7 @@ PARTS: Mapping[str, Any] = {
         {
             "amplitude": t["rated_torque"] * _between(r, 0.003, 0.03),
             "periods": float(r.choice([8, 12, 16, 18, 24])),
-            "phase": np.pi,
+            "phase": 0.0,
         },
     ),
 }

@@ -103,6 +103,25 @@ def test_good_parameters_are_tried_kept_and_compared_on_one_scale(session):
     assert (session.out / "verification.png").stat().st_size > 10_000
 
 
+def test_an_axis_that_begins_to_move_before_its_trial_says_that_nothing_was_written(
+    session, monkeypatch
+):
+    asked = []
+
+    def wait(group):
+        asked.append(group)
+        if len(asked) > 1:
+            raise PlanRefusedError("table: moves although its drive is disabled.")
+
+    monkeypatch.setattr(verifying, "wait_for_standstill", wait)
+    outcome = write(session)
+    assert outcome.code == 3
+    assert "table: moves although its drive is disabled." in outcome.err
+    assert "That was before the write: nothing was written." in outcome.err
+    assert session.changed() == {}
+    assert session.powered() == {}
+
+
 def test_what_was_written_is_stored_by_the_commands_that_are_named(session):
     """And compared with what was there before, not with itself."""
     said = " ".join(write(session).out.split())
