@@ -36,7 +36,8 @@ def no_worse(
     """Return controllers of which none is worse than what its drive has, and the axes that keep theirs.
 
     Only present controllers that keep the margin are to be beaten.  The other axes are designed anew
-    round those that are kept, where they do not go with them as they are.
+    round those that are kept, where they do not go with them as they are.  All keep theirs where new
+    ones of some would make an axis worse that keeps its own.
 
     Parameters
     ----------
@@ -73,6 +74,9 @@ def no_worse(
                 return present, every
             raise _worse(task, chosen, old, min(worse))
         chosen = mixed
+    hurt = _worse_axes(task, chosen, old, (good, stiff), frozenset())  # kept ones, by the others
+    if hurt and task.holds(present, every):
+        return present, every
     return chosen, kept
 
 

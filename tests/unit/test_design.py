@@ -134,6 +134,20 @@ def test_an_axis_that_can_not_be_improved_keeps_its_own_and_the_others_are_desig
     assert max(a.margins.sensitivity_peak for a in tuning.prediction.axes) <= 2.0 * 1.02
 
 
+@pytest.mark.parametrize("seed", [8, None])
+def test_an_axis_that_keeps_its_own_is_not_made_worse_by_the_others(
+    random_model: RandomModel, fresh_rng: np.random.Generator, seed: int | None
+) -> None:
+    """On the first machine the other axis arrives in half the time, and leaves this one swinging."""
+    rng = fresh_rng if seed is None else np.random.default_rng(seed)
+    model = random_model(rng, (2, 1))
+    tuning = design(model, sides_of(model, [Servo(loop) for loop in rule(model)]))
+    assert tuning.prediction is not None
+    assert tuning.present is not None
+    for new, was in zip(tuning.prediction.axes, tuning.present.axes, strict=True):
+        assert arrival(new) <= 1.05 * arrival(was)
+
+
 def test_an_axis_whose_drive_is_too_coarse_keeps_its_own(random_model: RandomModel) -> None:
     model = random_model(np.random.default_rng(8), (2, 1))
     sides = sides_of(model, [Servo(loop) for loop in rule(model)])
