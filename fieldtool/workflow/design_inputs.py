@@ -287,6 +287,8 @@ def _filter_at_no_frequency(
 def _holds(profile: DriveProfile, conversion: Conversion) -> dict[str, Hold]:
     """Return how the drive holds parameters of known units: within their types and the EDS' limits."""
     dictionary = None if profile.eds_path is None else read_eds(profile.eds_path)
+    if dictionary is not None:
+        profile = profile.with_types_of(dictionary)
     holds = {}
     for name, parameter in profile.parameters.items():
         if not conversion.understood(name) or parameter.told_type == UNKNOWN:
