@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 
 from fieldtool.errors import IdentificationError
-from fieldtool.identify.multisine import identify
+from fieldtool.identify.multisine import fit, identify
+from fieldtool.identify.multisine.dry_friction import DryFriction
 from fieldtool.identify.multisine.identify import JointIdentified, identify_joint
+from fieldtool.records.model import Estimate
 from fieldtool.records.recording import AxisInfo, Experiment, Recording
 
 STEP, SAMPLES, PERIODS = 1e-3, 1000, 4
@@ -69,6 +71,23 @@ def check(found: JointIdentified, friction: float) -> None:
         assert axis.masses[1].value == pytest.approx(LOAD, rel=0.005)
         assert axis.springs[0].value == pytest.approx(SPRING, rel=0.005)
         assert dry.value == pytest.approx(friction, abs=0.02 * friction + 0.01)
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_dry_friction_that_only_makes_the_fit_worse_was_none(
+    fresh_rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch, axis: int
+) -> None:
+    """A motion that is not steady yet leaves between the lines what looks like it, large as its push."""
+    sizes = [Estimate(0.0, 0.1), Estimate(0.0, 0.1)]
+    sizes[axis] = Estimate(1.0, 0.1)
+    told = DryFriction(("a", "b"), tuple(sizes), np.array([0.5, 0.5]))
+    monkeypatch.setattr(fit, "dry_friction", lambda *_: told)
+    found = identified(*[experiment(fresh_rng, 2) for _ in range(2)])
+    for one in found.model.axes:
+        assert one.masses[0].value == pytest.approx(MOTOR, rel=0.005)
+        assert one.masses[1].value == pytest.approx(LOAD, rel=0.005)
+        assert one.viscous_friction.value == pytest.approx(VISCOUS, rel=0.02)
+    assert not any(one["effect"] == "coulomb_friction" for one in found.model.effects)
 
 
 def test_a_motor_that_stands_in_one_experiment(fresh_rng: np.random.Generator) -> None:

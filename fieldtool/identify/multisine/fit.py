@@ -28,6 +28,8 @@ WEIGHTINGS = 2
 """Fits, each weighted with the response of the one before."""
 FRICTION_ROUNDS = 3
 """Of estimating dry friction and fitting without it."""
+WORSE = 2.0
+"""Times chi2 as it was from which taking off dry friction has made things worse."""
 WORTH = 25.0
 """By so much chi2 has to fall for each axis' friction at its last mass to be believed."""
 GOOD = 3.0
@@ -74,13 +76,19 @@ class JointFit:
         self._omega = frequencies_of(phasors)
 
     def run(self, start: RefinedModel, friction: DryFriction) -> tuple[RefinedModel, DryFriction]:
-        """Return the fitted machine, and the dry friction beside it; `friction`: as known before."""
-        fitted = self._weighted(start, self._freed(start, friction))
+        """Return the fitted machine, and the dry friction beside it; `friction`: as known before.
+
+        What makes the misfit WORSE when it is taken off was no dry friction, and stays in.
+        """
+        fitted, taken = self._weighted(start, self._freed(start, friction)), friction
         friction = self._friction(fitted, friction)
         for _ in range(FRICTION_ROUNDS):
             if not friction.seen(SEEN):
                 break
-            fitted = self._weighted(fitted, self._freed(fitted, friction))
+            without = self._weighted(fitted, self._freed(fitted, friction))
+            if without.chi2 > WORSE * max(fitted.chi2, fitted.degrees_of_freedom):
+                return fitted, taken
+            fitted, taken = without, friction
             friction = self._friction(fitted, friction)
         return fitted, friction
 
