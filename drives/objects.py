@@ -181,6 +181,7 @@ def _standard(index: int, subindex: int, data_type: DataType, name: str) -> Obje
 
 DEVICE_TYPE = _standard(0x1000, 0, "UNSIGNED32", "device type")
 ERROR_REGISTER = _standard(0x1001, 0, "UNSIGNED8", "error register")
+ERROR_COUNT = _standard(0x1003, 0, "UNSIGNED8", "number of errors")
 DEVICE_NAME = _standard(0x1008, 0, "VISIBLE_STRING", "manufacturer device name")
 FIRMWARE_VERSION = _standard(0x100A, 0, "VISIBLE_STRING", "manufacturer software version")
 STORE_ALL = _standard(0x1010, 1, "UNSIGNED32", "store all parameters")

@@ -42,6 +42,8 @@ logging.getLogger("canopen").setLevel(logging.CRITICAL)  # what goes wrong is ra
 CIA402_DEVICE = 402
 STOP_NODE, ENTER_PRE_OPERATIONAL, RESET_NODE = 0x02, 0x80, 0x81
 QUICK_STOP = 0x0002
+MOST_ERRORS = 8
+"""Entries of the error history that are read at most."""
 """Controlword."""
 WAKING = 0.1
 """Seconds at least from one call to a node that does not answer to the next."""
@@ -477,13 +479,33 @@ class CanopenDrive:
             )
 
     def last_error(self) -> str:
-        """Return the newest entry of the drive's error history 0x1003 in words."""
-        newest = ObjectInfo(ObjectAddress(0x1003, 1), "UNSIGNED32", "standard error field")
+        """Return the newest entry of the drive's error history 0x1003 in words, and those before it."""
         try:
-            code = self.read_optional(newest)
+            codes = self.error_history()
         except (SdoError, BusError):
             return "not readable"
-        return emergency_text(code & 0xFFFF) if code else "not recorded"
+        return ", before it ".join(map(emergency_text, dict.fromkeys(codes))) or "not recorded"
+
+    def error_history(self) -> tuple[int, ...]:
+        """Return the emergency codes in the drive's error history 0x1003, newest first.
+
+        Empty where it has none.
+
+        Raises
+        ------
+        SdoError
+            If an entry that its count promises can not be read.
+        """
+        count = self.read_optional(objects.ERROR_COUNT)
+        codes: list[int] = []
+        for k in range(1, 1 + min(MOST_ERRORS if count is None else count, MOST_ERRORS)):
+            entry = self.read_optional(
+                ObjectInfo(ObjectAddress(0x1003, k), "UNSIGNED32", f"standard error field {k}")
+            )
+            if entry is None:
+                break
+            codes.append(entry & 0xFFFF)
+        return tuple(code for code in codes if code)
 
     def switch_off(self, stopped: bool = False) -> int | None:
         """Write controlword 0 and return the statusword then, by SDO; None if there is no answer.

@@ -3,7 +3,7 @@
 from drives import objects
 from drives.canopen_drive.drive import CanopenDrive
 from drives.cia402 import Controlword, PowerState
-from drives.errors import DriveFaultError
+from drives.errors import DriveFaultError, SdoAbortError
 from drives.objects import ObjectAddress, ObjectInfo
 from drives.profile import UNKNOWN
 
@@ -12,18 +12,33 @@ HOST_LOST = (0x8130, 0x8120)
 RESET_COMMUNICATION = 0x82
 BOOT_TIME, RESET_TIME = 5.0, 1.0
 """Seconds that a node may take to boot, and a drive to leave its fault."""
-_NEWEST = ObjectInfo(ObjectAddress(0x1003, 1), "UNSIGNED32", "standard error field")
+_COMMUNICATION = 0x81
+"""High byte of the emergency codes of the communication."""
+_HARMLESS = 0x11
+"""Bits of the error register 0x1001 that a lost host sets: generic error, communication."""
+_ERROR_CODE = ObjectInfo(ObjectAddress(0x603F), "UNSIGNED16", "error code")
 
 
 def lost_its_host(drive: CanopenDrive) -> int | None:
     """Return the error code of a drive whose fault :func:`recover` ends; None if it is in no such one.
 
-    Nothing is written.
+    None too where the drive shows any other error, now or in its history: a fault that came before
+    or after the host's loss is a person's.  Nothing is written.
     """
     if drive.profile.recovery == UNKNOWN or drive.power_state() is not PowerState.FAULT:
         return None
-    code = (drive.read_optional(_NEWEST) or 0) & 0xFFFF
-    return code if code in HOST_LOST else None
+    try:
+        register = drive.read_optional(objects.ERROR_REGISTER) or 0
+        shown = drive.read_optional(_ERROR_CODE)
+        history = drive.error_history()
+    except SdoAbortError:
+        return None
+    if not history or history[0] not in HOST_LOST:
+        return None
+    if register & ~_HARMLESS or (shown is not None and shown not in HOST_LOST):
+        return None
+    others = any(code >> 8 != _COMMUNICATION for code in history)
+    return None if others else history[0]
 
 
 def recover(drive: CanopenDrive) -> str | None:

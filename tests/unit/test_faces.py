@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from drives.canopen_drive import CanopenDrive, setup
 from drives.canopen_drive.conversion import Conversion
 from drives.canopen_drive.line import Line
-from drives.canopen_drive.recovery import recover
+from drives.canopen_drive.recovery import HOST_LOST, lost_its_host, recover
 from drives.cia402 import PowerState
-from drives.errors import NotSupportedError, SdoAbortError
+from drives.errors import DriveFaultError, NotSupportedError, SdoAbortError
 from drives.objects import ObjectAddress, ObjectInfo, decode, encode
 from drives.parameters import DriveBackup, DriveRecord, HeldObject, JournalEntry, Phase
 from drives.parameters.access import take_over, unlock
@@ -24,6 +24,7 @@ from drives.parameters.changes import (
     read_parameters,
 )
 from drives.profile import load_drive, load_machine
+from drives.sim.emergency import ErrorRegister
 from drives.sim.faces import Motor, face_names, face_of
 from drives.sim.faces.others import PASSWORD
 from drives.sim.lockstep_bus import LockstepBus
@@ -338,6 +339,40 @@ class TestLostHost:
         node.motion.fault(0x2310, 2)
         assert recover(drive) is None
         assert drive.power_state() is PowerState.FAULT
+
+    @pytest.mark.parametrize("face", ["epos4", "reference"])
+    @pytest.mark.parametrize("code", HOST_LOST)
+    @pytest.mark.parametrize(
+        ("others", "bits"), [(0x2310, ErrorRegister.CURRENT), (0x4310, ErrorRegister.TEMPERATURE)]
+    )
+    @pytest.mark.parametrize("order", ["before", "after"])
+    @pytest.mark.parametrize("ended", ["none", "lost host", "other", "register not supported"])
+    def test_a_fault_beside_the_lost_host_is_left_to_a_person(
+        self, connected, face, code, others, bits, order, ended
+    ):
+        drive, node, _ = connected(face)
+        errors = [(others, bits), (code, ErrorRegister.COMMUNICATION)]
+        for one in errors if order == "before" else reversed(errors):
+            node.motion.fault(*one)
+        if ended == "register not supported":  # all but its generic bit may be missing
+            node.dictionary.set_read_callback(0x1001, 0, lambda: ErrorRegister.GENERIC)
+        elif ended != "none":
+            node.emergency.clear(code if ended == "lost host" else others)
+        assert lost_its_host(drive) is None
+        assert recover(drive) is None
+        assert drive.power_state() is PowerState.FAULT
+        with pytest.raises(DriveFaultError, match=f"0x{others:04X}"):
+            drive.check_idle()
+
+    @pytest.mark.parametrize("face", ["epos4", "reference"])
+    @pytest.mark.parametrize("codes", [(0x8130,), (0x8120,), (0x8120, 0x8130), (0x8130, 0x8120)])
+    def test_errors_of_the_communication_alone_are_the_lost_host(self, connected, face, codes):
+        drive, node, _ = connected(face)
+        for code in codes:
+            node.motion.fault(code, ErrorRegister.COMMUNICATION)
+        assert lost_its_host(drive) == codes[-1]
+        assert f"0x{codes[-1]:04X}" in recover(drive)
+        assert drive.power_state() is PowerState.SWITCH_ON_DISABLED
 
 
 def test_the_same_machine_whatever_its_face():
