@@ -406,15 +406,21 @@ def connect(
         for drive in drives:
             _identify(drive)
         _check_alone(line, drives)
-        recovered = []
-        for drive in drives if to_move else ():
-            drive.check_mode(Mode.CYCLIC_POSITION)
-            recovered.append(recover(drive))
-            drive.check_idle()
-            drive.read_scaling()
-            drive.check_limits()
+        recovered: list[str] = []
+        try:
+            for drive in drives if to_move else ():
+                drive.check_mode(Mode.CYCLIC_POSITION)
+                if said := recover(drive):
+                    recovered.append(said)
+                drive.check_idle()
+                drive.read_scaling()
+                drive.check_limits()
+        except BaseException as error:
+            for said in recovered:
+                error.add_note(said)
+            raise
         group = CanopenGroup(line, machine, drives, stop_requested)
-        group.recovered = tuple(said for said in recovered if said is not None)
+        group.recovered = tuple(recovered)
         yield group
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from drives.canopen_drive import CanopenGroup
+from drives.canopen_drive.recovery import lost_its_host
 from drives.errors import StoppedError, UserStopError
 from drives.profile import MachineProfile, load_machine
 from fieldtool.experiment.axes import Axes
@@ -84,7 +85,12 @@ def plan(
     """
     profile = machine if isinstance(machine, MachineProfile) else load_machine(machine)
     options = options or Options()
-    with connected(profile) as group:
+    with connected(profile, to_move=False) as group:
+        for drive in group.drives:
+            if lost_its_host(drive) is None:  # no obstacle to a plan, and not reset for it
+                drive.check_idle()
+            drive.read_scaling()
+            drive.check_limits()
         group.check_can_measure()
         setting = setting_of(profile, group, prior_model(profile))
         bare = tuple(map(without_feed_forward, group.drives, setting.loops))

@@ -9,13 +9,15 @@ import pytest
 
 from drives.canopen_drive import connect
 from drives.canopen_drive.setup import HOST_HEARTBEAT, HOST_LOST_AFTER
-from drives.errors import SafetyStopError
+from drives.errors import DriveFaultError, SafetyStopError
 from drives.sim.drive_faults import TorqueScaleWrong
-from drives.sim.emergency import HEARTBEAT_LOST
+from drives.sim.emergency import HEARTBEAT_LOST, ErrorRegister
 from drives.sim.faults import MotorReversed
 from drives.sim.host_faults import HostKilled
 from drives.sim.running import RunningMachine
+from drives.sim.state_machine import State
 from fieldtool.cli.main import main
+from fieldtool.workflow.fast_measuring import plan
 from tests.faces import machine_of, simulated
 
 TABLE = 11
@@ -184,3 +186,29 @@ def test_a_wrong_sign_is_found_on_makers_drives(face, fault, words, farthest, tm
         assert most < farthest
         assert objects(running) == before
         assert not any(n.motion.powered for n in running.nodes)
+
+
+# --- faults that a lost host left behind ----------------------------------------------------------
+
+
+def test_a_reset_fault_is_told_where_a_later_axis_is_refused(tmp_path):
+    machine = machine_of(("reference", "reference"), tmp_path)
+    with simulated(machine) as running:
+        lost, hot = running.nodes
+        lost.motion.fault(HEARTBEAT_LOST, ErrorRegister.COMMUNICATION)
+        hot.motion.fault(0x4310, ErrorRegister.TEMPERATURE)
+        with pytest.raises(DriveFaultError, match="0x4310") as refused, connect(machine):
+            pass
+        assert [note for note in refused.value.__notes__ if "The fault was reset" in note]
+
+
+def test_a_plan_resets_no_fault(tmp_path):
+    machine = machine_of(("reference", "reference"), tmp_path)
+    with simulated(machine) as running:
+        lost, other = running.nodes
+        lost.motion.fault(HEARTBEAT_LOST, ErrorRegister.COMMUNICATION)
+        assert plan(machine).duration > 0
+        assert lost.motion.state is State.FAULT
+        other.motion.fault(0x4310, ErrorRegister.TEMPERATURE)
+        with pytest.raises(DriveFaultError, match="0x4310"):
+            plan(machine)
