@@ -28,7 +28,7 @@ MOST_PARAMETERS = 60
 """Gains that are listed at most; a maker with more has other ideas of what a gain is."""
 _GAIN = re.compile(
     r"\b(gain|k[pivdrac]{1,3}|kr|tn|td|kc|feed.?forward|ff|notch|filter|observer|bandwidth"
-    r"|proportional|integral|reset time|damping|cut.?off|p.?factor)\b",
+    r"|proportional|integral|reset time|damping|cut.?off|p.?factor|(position|velocity|speed) [pid])\b",
     re.IGNORECASE,
 )
 _NOT_A_GAIN = re.compile(
@@ -173,6 +173,8 @@ def _behaviour(dictionary: ObjectDictionary) -> Iterator[str]:
     yield "# What the drive asks of SYNC (cycle times as `1 ms`), and what it does when one is missing."
     yield "sync: {shortest: unknown, longest: unknown, multiple: unknown, missing: unknown}"
     yield "interpolation: unknown   # linear: straight from one cyclic target to the next"
+    yield "# From torque reference to torque (current loop and half its step), where it is known:"
+    yield "#   torque_lag: 0.22 ms"
     yield "loop_period: unknown     # of position and velocity loop, such as 0.25 ms"
     offset = info_at(dictionary, _TORQUE_OFFSET.address)
     if offset is not None and offset.type == _TORQUE_OFFSET.type:
@@ -202,12 +204,13 @@ def _gains(dictionary: ObjectDictionary) -> Iterator[str]:
     yield "# or none."
     yield "gains_via: unknown"
     if not found:
-        yield "# The file has no objects that look like gains."
+        yield "# No object's name looks like a gain's: add the gains that the drive has as `parameters`."
         return
     yield "# Objects that look like gains, with the names that the maker gives them. Keep those of the"
     yield "# loops in use, call them position_p, velocity_p, velocity_i (or pid_p, pid_i, pid_d),"
-    yield "# velocity_ff, inertia_ff, in the order in which they are to be written; give `unit`, `scale`"
-    yield "# (SI value of one unit) and `write` (always, or disabled); take the others out."
+    yield "# velocity_ff, viscous_ff, inertia_ff, in the order in which they are to be written; give"
+    yield "# `unit`, `scale` (SI value of one unit) and `write` (always, or disabled). Take the others"
+    yield "# out, and add those that are missing: these were found by their names alone."
     yield "parameters:"
     names: set[str] = set()
     short = Counter(_slug(variable.name) for variable in found)
@@ -264,5 +267,6 @@ def _store(dictionary: ObjectDictionary) -> Iterator[str]:
     where = "0x1010:01 exists" if has else "no 0x1010"
     yield f"# {where}. To be found out: object, `signature` (usually save), `timeout`, whether a"
     yield "# `restart` is needed, and in which `states` the drive stores; then"
-    yield '#   store: {object: "0x1010:01", timeout: 10 s, restart: false, states: disabled}'
+    yield '#   store: {object: "0x1010:01", timeout: 10 s, restart: false, states: disabled,'
+    yield "#           duration: unknown}"
     yield "store: unknown"

@@ -62,6 +62,25 @@ def test_gains_are_listed_with_their_types(tmp_path):
     assert found.type == "UNSIGNED32"
 
 
+def test_gains_that_are_called_by_their_letter_are_listed(tmp_path):
+    made = new_profile(FOLDER / "reference.eds", tmp_path / "mine.yaml")
+    found = {str(p.object) for p in load_drive(made.path).parameters.values()}
+    assert found >= {f"0x2010:0{k}" for k in range(1, 7)}
+    text = made.path.read_text(encoding="utf-8")
+    assert "add those that are missing" in text
+    assert load_drive(made.path).torque_lag == 0
+    made.path.write_text(text.replace("#   torque_lag:", "torque_lag:"), encoding="utf-8")
+    assert load_drive(made.path).torque_lag == pytest.approx(0.22e-3)
+
+
+def test_the_proposed_store_line_can_be_taken_over(tmp_path):
+    made = new_profile(FOLDER / "reference.eds", tmp_path / "mine.yaml")
+    text = made.path.read_text(encoding="utf-8").replace("#   store:", "store:")
+    text = text.replace("#           duration:", "        duration:")
+    made.path.write_text(text.replace("\nstore: unknown", ""), encoding="utf-8")
+    assert load_drive(made.path).store.duration == "unknown"
+
+
 def test_a_file_that_is_there_is_not_overwritten(tmp_path):
     path = tmp_path / "mine.yaml"
     path.write_text("precious")
