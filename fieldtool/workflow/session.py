@@ -105,6 +105,10 @@ class Quiet:
         """Show nothing."""
 
 
+_NO_USE_TO_WRITE = ("plan", "excitation_time", "response", "motor_inertia")
+"""Options that say nothing of a session which only writes: its parameters were designed before."""
+
+
 @dataclass(frozen=True)
 class Options:
     """How a session is run."""
@@ -122,9 +126,11 @@ class Options:
     trace: Path | None = None
     """File that every frame of the session is noted in; none where it is None."""
 
-    def as_dict(self) -> dict[str, Any]:
-        """Plain values, as a session's log keeps them."""
-        return {**asdict(self), "trace": self.trace.name if self.trace else None}
+    def as_dict(self, command: str = "") -> dict[str, Any]:
+        """Plain values, as a session's log keeps them: of those that the command uses."""
+        values = {**asdict(self), "trace": self.trace.name if self.trace else None}
+        unused = _NO_USE_TO_WRITE if command in ("write", "tools") else ()
+        return {key: value for key, value in values.items() if key not in unused}
 
 
 @dataclass(frozen=True)
@@ -242,7 +248,7 @@ def open_session(
         machine=profile.name,
         version=version("fieldtool"),
         command=command,
-        options=options.as_dict(),
+        options=options.as_dict(command),
     )
     session.screen.stage(f"Connect to {profile.name}")
     try:

@@ -137,6 +137,13 @@ def test_the_journal_is_on_the_disk_before_the_first_write(session):
     assert notes() == []
 
 
+def test_the_event_of_a_write_names_the_options_that_it_used(session):
+    assert session.command("write", session.out, "--yes").code == 0
+    events = map(json.loads, (session.out / "events.jsonl").read_text().splitlines())
+    options = [e["options"] for e in events if e["event"] == "session" and e["command"] == "write"]
+    assert [sorted(one) for one in options] == [["store", "trace", "verify", "write"]]
+
+
 def test_the_journal_says_what_non_volatile_memory_may_hold(cut_off):
     journal = cut_off(2 * PER_DRIVE + 2, store=True)  # before the second drive stores
     assert [r.phase for r in journal.drives] == [Phase.STORED, Phase.STORING]
