@@ -219,17 +219,30 @@ def _least_squares(
     products = np.einsum("pin,pjn->ij", seen, seen)
     normal, base = products[1:, 1:], products[1:, 0]
     best = np.where(free, np.clip(known, 0.0, most), known)
-    chosen = np.flatnonzero(free)
+    chosen = np.flatnonzero(free & (most > 0))
     for k in np.tile(chosen, chosen.size):
         rest = base[k] + normal[k] @ best - normal[k, k] * best[k]
         best[k] = float(np.clip(-rest / max(float(normal[k, k]), 1e-300), 0.0, most[k]))
-    if chosen.size > 1:
-        inner = normal[np.ix_(chosen, chosen)]
-        fixed = base[chosen] + normal[chosen][:, ~free] @ best[~free]
-        every = np.linalg.solve(inner + 1e-12 * np.trace(inner) * np.eye(chosen.size), -fixed)
-        if np.all((every >= 0) & (every <= most[chosen])):
-            best[chosen] = every
+    inside = chosen
+    if chosen.size > 2:
+        inner = _alone(normal, base, best, chosen)
+        inside = chosen[(inner > 0) & (inner < most[chosen])]
+    if inside.size > 1:
+        inner = _alone(normal, base, best, inside)
+        if np.all((inner >= 0) & (inner <= most[inside])):
+            best[inside] = inner
     return best
+
+
+def _alone(
+    normal: FloatArray, base: FloatArray, best: FloatArray, chosen: NDArray[np.int_]
+) -> FloatArray:
+    """Return the shares that are best without their bounds, those that are not chosen held."""
+    held = np.delete(np.arange(best.size), chosen)
+    matrix = normal[np.ix_(chosen, chosen)]
+    right = base[chosen] + normal[np.ix_(chosen, held)] @ best[held]
+    step = 1e-12 * np.trace(matrix) * np.eye(chosen.size)
+    return np.asarray(np.linalg.solve(matrix + step, -right))
 
 
 def _outside(error: FloatArray, band: float) -> float:

@@ -14,7 +14,7 @@ from fieldtool.design.loops import Loops, system_matrix
 from fieldtool.design.machine import Machine, machine_of, respond
 from fieldtool.design.margins import margins_of
 from fieldtool.design.moves import TestMove, typical_move
-from fieldtool.design.no_worse import no_worse, predicted
+from fieldtool.design.no_worse import is_slower, no_worse, predicted
 from fieldtool.design.nonlinear import notes_of
 from fieldtool.design.notes import drive_notes
 from fieldtool.design.predict import Prediction, frequencies
@@ -173,13 +173,17 @@ def _at(task: Task) -> _Result:
     try:
         chosen, kept = no_worse(task, *held(task))
     except DesignError:
-        if softer is None:
+        if softer is None or is_slower(task, softer.servos):
             raise
         return _as_soft(task, softer)
     prediction = predicted(task, chosen)
-    if softer is not None and any(
-        axis.margins.bandwidth < NARROWER * width
-        for axis, width in zip(prediction.axes, softer.bandwidths, strict=True)
+    if (
+        softer is not None
+        and any(
+            axis.margins.bandwidth < NARROWER * width
+            for axis, width in zip(prediction.axes, softer.bandwidths, strict=True)
+        )
+        and not is_slower(task, softer.servos)
     ):
         return _as_soft(task, softer)
     return _Result(task, chosen, prediction, kept)

@@ -58,11 +58,13 @@ def no_sooner(
     steps = [inf if one.step is None else one.step.settling_time for one in (new, softer)]
     step = f", after a step {steps[0]:.3g} s, {steps[1]:.3g} s" if isfinite(sum(steps)) else ""
     unit = unit_on(side.kind, "rad/(N m)")
+    more = ""
+    if softer.margins.sensitivity_peak < new.margins.sensitivity_peak:
+        more = f" Where that does not matter, --response {names[1]} keeps more margin."
     return [
         f"{side.axis}: {names[0]} settles no sooner than {names[1]} here: {times[0]:.3g} s from the "
         f"beginning of its typical move, {times[1]:.3g} s with {names[1]}{step}; a torque or force "
-        f"moves its motor by up to {new.compliance:.3g} {unit}, {softer.compliance:.3g} {unit}. Where "
-        f"that does not matter, --response {names[1]} keeps more margin."
+        f"moves its motor by up to {new.compliance:.3g} {unit}, {softer.compliance:.3g} {unit}.{more}"
     ]
 
 

@@ -74,10 +74,23 @@ def no_worse(
                 return present, every
             raise _worse(task, chosen, old, min(worse))
         chosen = mixed
-    hurt = _worse_axes(task, chosen, old, (good, stiff), frozenset())  # kept ones, by the others
-    if hurt and task.holds(present, every):
-        return present, every
+    if hurt := _worse_axes(
+        task, chosen, old, (good, stiff), frozenset()
+    ):  # kept ones, by the others
+        if task.holds(present, every):
+            return present, every
+        raise _worse(task, chosen, old, min(hurt))
     return chosen, kept
+
+
+def is_slower(task: Task, servos: tuple[Servo, ...]) -> bool:
+    """Return whether an axis would be slower than with its present controller, where that counts."""
+    present = task.present
+    old = None if present is None else predicted(task, present, spread=False)
+    if old is None or not old.stable:
+        return False
+    good = [axis.margins.sensitivity_peak <= SLACK * task.most for axis in old.axes]
+    return bool(_worse_axes(task, servos, old, (good, [False] * len(good)), frozenset()))
 
 
 def _firmer(

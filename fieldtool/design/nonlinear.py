@@ -75,8 +75,9 @@ def _pull(name: str, what: str, size: float, servo: Servo, unit: str) -> str:
         time = f" for about {loop.velocity_p / loop.velocity_i:.2g} s after a move"
     return (
         f"{name}: {what} may pull the motor up to {_away(servo, size):.3g} {unit} off its target{time}; "
-        "what is predicted of moves does not have it. Where that is too far, stiffer parameters hold "
-        "it: --response stiff, or the present ones."
+        "what is predicted of moves does not have it. Where that is too far, a loop that gives way "
+        "less holds it better: compare the compliance of the responses (`fieldtool design FOLDER "
+        "--compare`) and of the present parameters."
     )
 
 

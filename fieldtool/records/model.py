@@ -69,8 +69,8 @@ class AxisModel:
 
     @property
     def total_friction(self) -> float:
-        """Viscous friction of its first and its last mass, N m s/rad or N s/m."""
-        return self.viscous_friction.value + self.load_friction.value
+        """Viscous friction of its first and its last mass, N m s/rad or N s/m; less than 0 is none."""
+        return max(self.viscous_friction.value + self.load_friction.value, 0.0)
 
 
 @dataclass(frozen=True)

@@ -73,13 +73,14 @@ def choice_sentences(tuning: Tuning) -> list[str]:
             )
         if one.kept:
             told.append(f"{one.response} keeps the present parameters of {listed(one.kept)}.")
-    told.append(f"* is what was chosen; for another: `{_command(tuning, 'NAME')}`.")
     missing = [one.response for one in tuning.responses if not (one.prediction or one.refused)]
+    all_three = "" if missing else " --compare"
+    told.append(f"* is what was chosen; for another: `{_command(tuning, 'NAME')}{all_three}`.")
     if missing:
         command = _command(tuning, tuning.response)
         told.append(
-            f"{listed(missing)}: not computed yet; `{command} --compare` shows all three, in the time "
-            f"that {tuning.responses[-1].response} takes."
+            f"{listed(missing)}: not computed in this design; `{command} --compare` shows all three, in "
+            f"the time that {tuning.responses[-1].response} takes."
         )
     return told
 

@@ -98,7 +98,7 @@ def test_all_three_are_there_and_the_stiffer_the_wider_and_the_nearer_to_the_bou
         assert itself is not None
         assert one.prediction.as_dict() == itself.as_dict()
     assert choice_rows(alone["stiff"]) == choice_rows(tuning), "nothing is left to compute"
-    assert not any("--compare" in said for said in choice_sentences(alone["stiff"]))
+    assert not any("not computed" in said for said in choice_sentences(alone["stiff"]))
     assert choice_titles(alone["stiff"])[-3:] == ("soft", "normal", "stiff *")
 
 
@@ -112,7 +112,7 @@ def test_what_was_not_computed_is_said_with_the_command_that_does(
     assert "-" not in column(tuning, "soft *")
     assert [one.prediction is None for one in tuning.responses] == [False, True, True]
     text = " ".join(shown(tuning).split())
-    assert "normal and stiff: not computed yet" in text
+    assert "normal and stiff: not computed in this design" in text
     assert "`fieldtool design FOLDER --response soft --bound 1.9 --compare`" in text
 
 

@@ -24,6 +24,7 @@ from fieldtool.design.rule import DesignError, rule
 from fieldtool.design.search import LOW_PASS, NOTCH, Best
 from fieldtool.design.servo import Servo, Timing
 from fieldtool.design.shaping import NAMES, best_shaper, impulses, vibration_left
+from fieldtool.design.start import slower
 from fieldtool.design.tuning import as_parameters
 from fieldtool.design.tuning_file import read_tuning, tuning_as_dict
 from fieldtool.design.uncertainty import samples_of
@@ -132,6 +133,26 @@ def test_an_axis_that_can_not_be_improved_keeps_its_own_and_the_others_are_desig
     assert arrival(tuning.prediction.axes[1]) < arrival(tuning.present.axes[1])
     assert tuning.prediction.axes[1].compliance < 0.8 * tuning.present.axes[1].compliance
     assert max(a.margins.sensitivity_peak for a in tuning.prediction.axes) <= 2.0 * 1.02
+
+
+@pytest.mark.parametrize(("seed", "scales"), [(2, (1.0, 4.0)), (2, (4.0, 1.0)), (7, (1.0, 4.0))])
+def test_no_response_has_parameters_of_a_softer_one_that_are_slower_than_the_present(
+    random_model: RandomModel, seed: int, scales: tuple[float, float]
+) -> None:
+    model = random_model(np.random.default_rng(seed), (1, 1))
+    loops = [slower(Servo(loop), by) for loop, by in zip(rule(model), scales, strict=True)]
+    sides = [
+        DriveSide(axis.name, torque_limit=200 * axis.total_mass, present=as_parameters(servo))
+        for axis, servo in zip(model.axes, loops, strict=True)
+    ]
+    try:
+        tuning = design(model, sides)
+    except DesignError:
+        return  # nothing is written then
+    assert tuning.prediction is not None
+    assert tuning.present is not None
+    for new, was in zip(tuning.prediction.axes, tuning.present.axes, strict=True):
+        assert arrival(new) <= 1.05 * arrival(was)
 
 
 @pytest.mark.parametrize("seed", [8, None])

@@ -129,7 +129,10 @@ def test_the_command_says_what_is_there_and_what_will_be(
     assert yaml.safe_load(folder.tuning.read_text()) == data
     there = {one["response"]: one["prediction"] is not None for one in data["responses"]}
     assert there == {"soft": True, "normal": False, "stiff": False}
-    assert "normal and stiff: not computed yet; `fieldtool design FOLDER --response soft" in shown
+    assert (
+        "normal and stiff: not computed in this design; `fieldtool design FOLDER --response soft"
+        in shown
+    )
     main_code(["design", str(folder.path), "--response", "soft", "--compare", "--json"])
     compared = yaml.safe_load(capsys.readouterr().out)
     assert all(one["prediction"] or one["refused"] for one in compared["responses"])

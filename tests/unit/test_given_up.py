@@ -165,8 +165,10 @@ def test_a_stiff_response_that_settles_no_sooner_says_so(kind: str) -> None:
         told = no_sooner(task.sides[0], one, replace(was, load=was.move), ("stiff", "normal"))
         assert bool(told) == said
     unit = {"rotary": "rad/(N m)", "linear": "m/N"}[kind]
-    assert f"{was.compliance:.3g} {unit}. Where" in told[0]
-    assert told[0].endswith("--response normal keeps more margin.")
+    assert told[0].endswith(f"{was.compliance:.3g} {unit}."), "as much margin as the softer one"
+    less = replace(one, margins=replace(one.margins, sensitivity_peak=3.0))
+    [told] = no_sooner(task.sides[0], less, replace(was, load=was.move), ("stiff", "normal"))
+    assert told.endswith("--response normal keeps more margin.")
     away = replace(new, move=None)
     assert no_sooner(task.sides[0], away, was, ("stiff", "normal")) == []
 
