@@ -41,6 +41,7 @@ def drive_loop(drive: CanopenDrive, servo: Servo) -> DriveLoop:
         timing.lag,
         unsure,
         0.0 if profile.interpolation == "linear" else timing.cycle,
+        0.0 if profile.loop_period != UNKNOWN else CAUTIOUS_PERIOD / 2,
         servo.torque_noise(abs(drive.scaling.position)),
         servo.count_torque(abs(drive.scaling.position)),
         _why_not_told(drive),

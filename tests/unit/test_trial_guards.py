@@ -168,6 +168,85 @@ def test_a_controller_that_was_written_is_never_doubted(
     assert first_alarm(watch(loop, noise=sigma), position, torque, target) is None
 
 
+UNKNOWN_TIMES = Timing(1e-3, 0.5e-3)
+"""What is reckoned with where a profile does not know them."""
+
+
+def unknown(loop, count=COUNT):
+    """What a watch is told of a drive whose loops' period and torque lag are not known."""
+    servo = Servo(loop, timing=UNKNOWN_TIMES)
+    return {
+        "period": UNKNOWN_TIMES.period,
+        "lag": UNKNOWN_TIMES.lag,
+        "unsure": 1.05e-3,
+        "unsure_velocity": 0.5 * UNKNOWN_TIMES.period,
+        "encoder": servo.torque_noise(count),
+        "count": servo.count_torque(count),
+    }
+
+
+def quick_path(way, count):
+    """A move that feed-forward makes nearly by itself, out and back."""
+    u = np.arange(round(0.2 / STEP)) * STEP / 0.2
+    out = np.round(way * u**3 * (10 - 15 * u + 6 * u * u) / count) * count
+    return np.concatenate([np.zeros(60), out, np.full(60, out[-1]), out[-1] - out, np.zeros(50)])
+
+
+def sentences(one, position, torque, target):
+    return [
+        text
+        for q, t, r in zip(position, torque, target, strict=True)
+        for _, text in one.take([q], [t], [r], [0.0], fresh=True)
+    ]
+
+
+RIGID = {"load": 1e-3 * INERTIA, "spring": 1e-3 * INERTIA * (2 * np.pi * 15.0) ** 2}
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    bandwidth=st.floats(40.0, 100.0),
+    ratio=st.floats(1.8, 4.0),
+    ahead=st.floats(0.95, 1.0),
+    way=st.floats(0.1, 0.4),
+    noise=st.floats(0.0, 0.05),
+    seed=st.integers(0, 2**31),
+)
+def test_gains_that_were_written_are_never_doubted_where_times_are_not_known(
+    bandwidth, ratio, ahead, way, noise, seed
+):
+    """Four times as quick as is reckoned with, so its velocity comes earlier; its position does not."""
+    fine = COUNT / 16
+    velocity_p = bandwidth * INERTIA
+    loop = AxisLoop(bandwidth / ratio, velocity_p, bandwidth / 4 * velocity_p, 1.0, ahead * INERTIA)
+    target = quick_path(way, fine)
+    position, torque = Axis(loop, **RIGID).run(target, noise, seed, fine)
+    said = sentences(watch(loop, noise=noise, **unknown(loop, fine)), position, torque, target)
+    assert not [text for text in said if "times what was written" in text]
+
+
+def test_without_what_is_not_known_of_its_velocity_good_gains_would_be_doubted():
+    fine = COUNT / 16
+    loop = AxisLoop(40.0, 71.0 * INERTIA, 71.0 * 46.0 * INERTIA, 1.0, 0.97 * INERTIA)
+    target = quick_path(0.2, fine)
+    position, torque = Axis(loop, **RIGID).run(target, 0.02, 3, fine)
+    known = unknown(loop, fine) | {"unsure_velocity": 0.0}
+    assert sentences(watch(loop, noise=0.02, **known), position, torque, target)
+    one = watch(loop, noise=0.02, **unknown(loop, fine))
+    assert not sentences(one, position, torque, target)
+
+
+@pytest.mark.parametrize("factor", [0.1, 10.0])
+@pytest.mark.parametrize("names", [("velocity_p", "velocity_i"), ("position_p",)])
+def test_gains_ten_times_off_show_where_times_are_not_known(names, factor):
+    fine = COUNT / 16
+    held = replace(GOOD, **{name: factor * getattr(GOOD, name) for name in names})
+    for target in (trial_path(GOOD, fine)[0], quick_path(0.2, fine)):
+        position, torque = Axis(held).run(target, 0.02, 3, fine)
+        one = watch(GOOD, noise=0.02, **unknown(GOOD, fine))
+        assert sentences(one, position, torque, target)
+
+
 WRONG = {
     "gains ten times too high": {"velocity_p": 10.0, "velocity_i": 10.0},
     "gains of the wrong sign": {"velocity_p": -1.0, "velocity_i": -1.0},

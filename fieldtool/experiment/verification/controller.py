@@ -31,6 +31,7 @@ PARTS = 5
 """Of a torque: by reference what position gain, velocity gain and feed-forward of torque (with the
 offset) make; by position what position gain and velocity gain make."""
 FROM_REFERENCE, FROM_POSITION = slice(0, 3), slice(3, 5)
+BY_VELOCITY = 4
 LATE = 2
 """Cycles from a SYNC to the one after which its torque is foretold, less one that is the newest."""
 
@@ -50,6 +51,8 @@ class DriveLoop:
     """s, by which its torque may come earlier or later than this says."""
     unsure_targets: float = 0.0
     """s, by which its reference may besides: where it is not known how it goes from target to target."""
+    unsure_velocity: float = 0.0
+    """s, by which its velocity may be late besides: where its period is not known."""
     noise: float = 0.0
     """RMS of the torque that the steps of its encoder make, N m or N."""
     count: float = 0.0

@@ -7,12 +7,15 @@ positions that are told late, and by the noise of the one torque from which slow
 fades as they do::
 
     told - expected = a position + b velocity + c fed forward
-                      + t d(expected)/dt + u d(what positions make)/dt + s fading + noise
+                      + t d(expected)/dt + u d(what positions make)/dt
+                      + w d(what velocities make)/dt + s fading + noise
 
-by least squares over the last cycles (forgotten exponentially), with prior knowledge of c, t, u and s
+by least squares over the last cycles (forgotten exponentially), with prior knowledge of c, t, u, w and s
 (Gaussian: Bishop 2006, equations 3.53 and 3.54).  A position that is told late has its own column: what
 reference and position make nearly cancel in good tracking, so the whole hardly changes where what is
-late does.  1 + a and 1 + b are the factors.  Both at once, a = b,
+late does.  A velocity is a difference quotient, late by half a period of the loops: where nobody knows
+that period it has a column too, for what it makes in good tracking is as large as all the feedback
+(w is nothing where the period is known).  1 + a and 1 + b are the factors.  Both at once, a = b,
 is a test of its own: gains that are wrong together may show before they can be told apart.
 
 So a gain is told wrong, too high or too low, while its part is still hidden by a larger one: a good
@@ -48,7 +51,9 @@ SEEN = 3
 """Cycles after another that are enough."""
 NAMES = ("feedback", "position gain", "velocity gain")
 """What is tested: all gains of the feedback by one factor, and each of two by its own."""
-COLUMNS = 6
+COLUMNS = 7
+NONE_OFF = 1e-4
+"""Cycles: as good as no column at all."""
 TINY = 1e-300
 
 
@@ -65,6 +70,8 @@ class GainEstimate:
         Position gain over the rate of cycles, shape (M,): its share of what an encoder's step makes.
     late
         s, by which torques may be late, standard deviation, shape (M,).
+    late_velocity
+        s, by which velocities may be late besides, shape (M,); 0 where their time is known.
     step
         Cycle time, s.
     fades
@@ -79,6 +86,7 @@ class GainEstimate:
         encoder: FloatArray,
         position: FloatArray,
         late: FloatArray,
+        late_velocity: FloatArray,
         step: float,
         fades: float,
         off: FloatArray | None = None,
@@ -93,9 +101,11 @@ class GainEstimate:
         """Largest shares that were surely off so far, shape (3, M)."""
         learned = np.zeros((len(NAMES), m)) if off is None else off
         self._allowed = np.where(learned > MOST_LEARNED, np.inf, np.maximum(OFF, LEARNED * learned))
-        prior = np.tile([ANY_OFF, ANY_OFF, FED_OFF, 1.0, TOLD_OFF, 1.0], (m, 1))
+        prior = np.tile([ANY_OFF, ANY_OFF, FED_OFF, 1.0, TOLD_OFF, 1.0, 1.0], (m, 1))
         prior[:, 3] = LATE_OFF + late / step
-        prior[:, 5] = BEGUN_OFF * np.sqrt(self._square)
+        prior[:, 5] = np.maximum(late_velocity / step, NONE_OFF)
+        self._fitted = COLUMNS - 1 + (late_velocity > 0)
+        prior[:, 6] = BEGUN_OFF * np.sqrt(self._square)
         self._prior = np.zeros((m, COLUMNS, COLUMNS))
         self._prior[:, range(COLUMNS), range(COLUMNS)] = prior**-2
         # position and velocity gain by one factor
@@ -117,8 +127,9 @@ class GainEstimate:
         Parameters
         ----------
         parts
-            Of the expected torque, shape (5, M): by position gain, by velocity gain, fed forward, and
-            what the whole, and what the part by positions, changed since the cycle before.
+            Of the expected torque, shape (6, M): by position gain, by velocity gain, fed forward, and
+            what the whole, what the part by positions, and of it what velocities make, changed since
+            the cycle before.
         difference
             Told less expected torque, shape (M,).
         """
@@ -166,5 +177,5 @@ class GainEstimate:
         """Return the mean square of what shares, (M, COLUMNS), leave of the difference, shape (M,)."""
         squares = self._squares - 2 * (shares * self._base).sum(axis=1)
         squares += np.einsum("mi,mij,mj->m", shares, self._normal, shares)
-        left: FloatArray = np.maximum(squares, 0.0) / (self._cycles - COLUMNS)
+        left: FloatArray = np.maximum(squares, 0.0) / (self._cycles - self._fitted)
         return left

@@ -20,6 +20,7 @@ from math import exp
 import numpy as np
 
 from fieldtool.experiment.verification.controller import (
+    BY_VELOCITY,
     FROM_POSITION,
     FROM_REFERENCE,
     LATE,
@@ -120,6 +121,7 @@ class IdentityWatch:
             encoder,
             np.array([loop.loop.position_p * self._step for loop in loops]),
             self._late[1],
+            np.array([loop.unsure_velocity for loop in loops]),
             self._step,
             self._passed,
             None if learned is None else learned.gains,
@@ -227,6 +229,7 @@ class IdentityWatch:
         now[:-1] = self._expected.advance(targets.T, positions.T)
         now[-1] = rows[-LATE][1]
         quick = self._passed * (self._quick + now - self._before)
+        velocity = quick[BY_VELOCITY] - self._quick[BY_VELOCITY]
         both = np.stack([quick[FROM_REFERENCE].sum(axis=0), quick[FROM_POSITION].sum(axis=0)])
         changed, self._last = both - self._last, both
         turns, slope = changed[1] / self._step, np.abs(changed) / self._step
@@ -248,7 +251,7 @@ class IdentityWatch:
             self._quick[-1] = expected
             return []
         gained = [quick[0] + quick[3], quick[1] + quick[4], quick[2]]
-        parts = np.stack([*gained, changed.sum(axis=0), changed[1]])
+        parts = np.stack([*gained, changed.sum(axis=0), changed[1], velocity])
         gains = [] if self._gains is None else self._gains.take(parts, off)
         self._compared += 1
         self._over = [*self._over[1 - OF :], difference / allowed]
