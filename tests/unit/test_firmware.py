@@ -798,6 +798,7 @@ EVERY_PARAMETER: dict[Parameter, tuple[float, str, dict[Parameter, float]]] = {
     P.VELOCITY_I: (200.0, "position", {}),
     P.VELOCITY_FF: (0.5, "position", {}),
     P.INERTIA_FF: (INERTIA, "position", {}),
+    P.VISCOUS_FF: (0.5, "position", {}),
     P.VELOCITY_FILTER: (100.0, "position", {}),
     P.FILTER1_TYPE: (1, "position", {}),
     P.FILTER1_FREQUENCY: (300.0, "position", {P.FILTER1_TYPE: 1}),
@@ -860,6 +861,7 @@ def test_closed_loop_against_an_independent_simulation() -> None:
     """The same loops in plain Python, written from the block diagram, give the same motion."""
     axes = tuned_axis(friction=0.3)
     axes.set(0, P.VELOCITY_FF, 0.7)
+    axes.set(0, P.VISCOUS_FF, 0.2)
     axes.set(0, P.TORQUE_LIMIT, 3.0)
     h, w = 1 / RATE, 2 * pi * 1000.0
     x = v = velocity = integral = torque = counts = 0.0
@@ -871,7 +873,7 @@ def test_closed_loop_against_an_independent_simulation() -> None:
         axes.follow_position(0, target, 8)
         for j in range(8):
             error = TUNED[P.POSITION_P] * (reference - counts / COUNTS) + 0.7 * speed - velocity
-            wanted = TUNED[P.VELOCITY_P] * error + integral
+            wanted = TUNED[P.VELOCITY_P] * error + integral + 0.2 * speed
             given = min(max(wanted, -3.0), 3.0)
             if given == wanted or (wanted > given) != (error > 0):
                 integral = min(max(integral + TUNED[P.VELOCITY_I] * error * h, -3.0), 3.0)
