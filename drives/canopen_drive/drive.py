@@ -42,9 +42,9 @@ logging.getLogger("canopen").setLevel(logging.CRITICAL)  # what goes wrong is ra
 CIA402_DEVICE = 402
 STOP_NODE, ENTER_PRE_OPERATIONAL, RESET_NODE = 0x02, 0x80, 0x81
 QUICK_STOP = 0x0002
+"""Controlword."""
 MOST_ERRORS = 8
 """Entries of the error history that are read at most."""
-"""Controlword."""
 WAKING = 0.1
 """Seconds at least from one call to a node that does not answer to the next."""
 
