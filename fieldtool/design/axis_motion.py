@@ -68,6 +68,7 @@ class AxisMotion:
         fed: Fed,
     ) -> None:
         self.bounds, self.move, self.fed, self.mass = bounds, moves[axis], fed, fed.mass
+        self._free, self._most_inertia = fed.free, self._most_inertia_of(servos[axis])
         others = [i for i in range(len(servos)) if i != axis]
         wave, s = grids.wave, 1j * grids.wave.omega
         self._wave, self._tick = wave, wave.duration / wave.samples
@@ -130,14 +131,23 @@ class AxisMotion:
     def fed_forward(self, servo: Servo) -> Servo:
         """Return a controller with the feed-forward that fits its feedback best."""
         gain, torque, pi = self._slow.gain(servo)
-        return self._feed_forward(servo, 1 / (1 + gain * self._motor), torque, pi)[0]
+        shares, _, _ = self._feed_forward(servo, 1 / (1 + gain * self._motor), torque, pi)
+        velocity, inertia, *friction = shares.tolist()
+        loop = replace(
+            servo.loop,
+            velocity_ff=velocity,
+            viscous_ff=sum(friction) * servo.loop.velocity_p,
+            inertia_ff=inertia * self.mass,
+        )
+        return replace(servo, loop=loop)
 
     def _feed_forward(
         self, servo: Servo, sensitivity: ComplexArray, torque: ComplexArray, pi: ComplexArray
-    ) -> tuple[Servo, FloatArray, ComplexArray]:
-        """Return the controller, errors of motor and last mass on the move (2, N), the torque's phasors.
+    ) -> tuple[FloatArray, FloatArray, ComplexArray]:
+        """Return the shares, errors of motor and last mass on the move (2, N), and the torque's phasors.
 
-        Shares are those of least squares over the time after the move, and a little before it.
+        Shares are those of least squares over the time after the move, and a little before it: of
+        velocity, inertia, and where there is such a feed-forward, friction over the velocity's P.
         """
         wave, drive = self._wave, self._target * sensitivity
         parts = [pi * servo.loop.position_p * drive]
@@ -154,32 +164,21 @@ class AxisMotion:
         signals = wave.signal(spectra)
         signals[:, 0] -= self._wanted
         seen = signals * self._weight
+        most = np.array([1.0, self._most_inertia, MOST_FED * self.fed.viscous / loop.velocity_p])
         count = len(known)
-        free, most = self.fed.free[:count], self._most_fed(servo)[:count]
-        best = _least_squares(seen, np.array(known), free, most)
+        best = _least_squares(seen, np.array(known), self._free[:count], most[:count])
         errors, phasors = signals[:, 0], parts[0]
         for k, share in enumerate(best, 1):
             errors, phasors = errors + share * signals[:, k], phasors + share * parts[k]
-        viscous = float(best[2]) * loop.velocity_p if count > 2 else 0.0
-        fed = replace(
-            loop,
-            velocity_ff=float(best[0]),
-            viscous_ff=viscous,
-            inertia_ff=float(best[1]) * self.mass,
-        )
-        return replace(servo, loop=fed), errors, phasors
+        return best, errors, phasors
 
-    def _most_fed(self, servo: Servo) -> FloatArray:
-        """Return the largest shares of velocity, inertia, and friction (over the velocity's P).
-
-        Targets are rounded to encoder steps.
-        """
+    def _most_inertia_of(self, servo: Servo) -> float:
+        """Return the largest share of inertia: targets are rounded to encoder steps."""
         alone = replace(servo.loop, velocity_ff=0.0, viscous_ff=0.0, inertia_ff=self.mass)
         noise = replace(servo, loop=alone).target_noise(self.bounds.resolution)
-        inertia = MOST_FED
-        if isfinite(noise) and isfinite(self.bounds.noise) and noise > 0:
-            inertia = min(inertia, FED_NOISE * self.bounds.noise / noise)
-        return np.array([1.0, inertia, MOST_FED * self.fed.viscous / servo.loop.velocity_p])
+        if not (isfinite(noise) and isfinite(self.bounds.noise) and noise > 0):
+            return MOST_FED
+        return min(MOST_FED, FED_NOISE * self.bounds.noise / noise)
 
     def figures(self, servo: Servo) -> tuple[float, float]:
         """Return a smooth measure of the time outside of the band, s, and the move's largest torque."""
