@@ -53,16 +53,14 @@ def no_worse(
     DesignError
         If new parameters are worse, and the present ones do not keep the margin on all machines.
     """
-    present = task.present
-    old = None if present is None else predicted(task, present, spread=False)
-    if present is None or old is None or not old.stable:
+    present, beaten = task.present, _to_beat(task)
+    if present is None or beaten is None:
         return chosen, kept
-    peaks = [axis.margins.sensitivity_peak for axis in old.axes]
-    good = [peak <= SLACK * task.most for peak in peaks]
+    old, good = beaten
     every = frozenset(range(len(present)))
     # no response asks to give up stiffness, and no machine that the model allows
     firm = not task.softens and task.holds(present, every)
-    stiff = [firm and peak <= SLACK * task.bound for peak in peaks]
+    stiff = [firm and one.margins.sensitivity_peak <= SLACK * task.bound for one in old.axes]
     chosen, kept = _firmer(task, chosen, old, (good, stiff), kept)
     while worse := _worse_axes(task, chosen, old, (good, stiff), kept):
         kept |= worse
@@ -83,13 +81,24 @@ def no_worse(
     return chosen, kept
 
 
-def is_slower(task: Task, servos: tuple[Servo, ...]) -> bool:
-    """Return whether an axis would be slower than with its present controller, where that counts."""
+def _to_beat(task: Task) -> tuple[Prediction, list[bool]] | None:
+    """Return what the present controllers do, and which of them count: they keep the margin.
+
+    None where they are not known, or not stable.
+    """
     present = task.present
     old = None if present is None else predicted(task, present, spread=False)
     if old is None or not old.stable:
+        return None
+    return old, [axis.margins.sensitivity_peak <= SLACK * task.most for axis in old.axes]
+
+
+def is_slower(task: Task, servos: tuple[Servo, ...]) -> bool:
+    """Return whether an axis would be slower than with its present controller, where that counts."""
+    beaten = _to_beat(task)
+    if beaten is None:
         return False
-    good = [axis.margins.sensitivity_peak <= SLACK * task.most for axis in old.axes]
+    old, good = beaten
     return bool(_worse_axes(task, servos, old, (good, [False] * len(good)), frozenset()))
 
 
