@@ -6,7 +6,7 @@ from math import pi
 import pytest
 import yaml
 from durand.services.sdo.server import SDODomainAbort
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from drives.canopen_drive import connect
@@ -48,17 +48,24 @@ def machine(tmp_path):
     outer=st.floats(0.5, 40),
     inner=st.floats(0.05, 0.5),
 )
+@example(constant=0.1, counts=1000, outer=1.0, inner=0.0546875)  # half a unit
 def test_files_alone_give_the_face_that_was_written_by_hand(name, constant, counts, outer, inner):
     gains = {"position_p": outer, "velocity_p": inner, "velocity_i": 0.3 * inner * outer}
     if name == "reference":
         gains |= {"velocity_ff": 0.5, "filter1_type": 1, "filter1_frequency": 90.0}
     motor = Motor(4.0, 12.0, round(constant, 6), counts, counts / (2 * pi), gains)
     profile = load_drive(name)
-    found = []
+    found, start = [], {}
     for face in (own_face(profile, profile.eds_path), face_of(name)):
         loops = face.loops(motor)
+        factory = loops.factory()
+        start = start or factory
+        for key, value in factory.items():  # half a unit may round either way
+            assert value == pytest.approx(
+                start.get(key, value), rel=1e-6, abs=isinstance(value, int)
+            )
         held = {key: entry.default for key, entry in face.entries.items()}
-        held |= face.values(motor) | loops.factory()
+        held |= face.values(motor) | factory | start
         acting = loops.settings(lambda i, s, held=held: held[i, s])
         found.append({p.name: v for p, v in acting.items()} | {"unit": face.units(motor)[0]})
         for what in ("latches", "hidden", "fault_after_lost_heartbeat"):
