@@ -72,13 +72,15 @@ class AxisMotion:
         others = [i for i in range(len(servos)) if i != axis]
         wave, s = grids.wave, 1j * grids.wave.omega
         self._wave, self._tick = wave, wave.duration / wave.samples
-        self._slow = Sampled.of(s, servos[axis].timing)
+        slow = self._slow = Sampled.of(s, servos[axis].timing)
         gains = without(np.stack([servo.gain(s) for servo in servos], axis=-1), axis)
         closed = closed_compliance(grids.slow, gains)
         loads = grids.loads - np.einsum("wij,wj,wjk->wik", grids.loads, gains, closed)
         self._motor = closed[:, axis, axis]
         self._plants = np.stack([self._motor, loads[:, axis, axis]])
-        self._target = wave.spectrum(wave.move(self.move))
+        target = wave.spectrum(wave.move(self.move))
+        self._targets = target * np.stack([np.ones_like(s), s, slow.acceleration * self.mass, s])
+        """Of the move: position, velocity, what inertia feed-forward gives, velocity again."""
         self._step = wave.spectrum(wave.step(DISTURBANCE * self.mass * self.move.acceleration))
         self._wanted = wave.move(self.move)
         friction = self._friction(grids, axis)
@@ -87,19 +89,22 @@ class AxisMotion:
         least = float(np.abs(self.mass * acceleration + friction).max())
         self.most_torque = bounds.torque if least <= bounds.torque else ROOM * least
         """Of the move, N m or N."""
-        self._begin = int(np.searchsorted(wave.time, self.move.duration))
-        self._weight = np.where(wave.time >= self.move.duration, 1.0, DURING)
+        after = [wave.time >= move.duration for move in moves]
+        self._weight = np.where(after[axis], 1.0, DURING)
+        self._per_band = after[axis] / (INNER_BAND * self.move.settling_band)
         # position = there - back C S, for motor and last mass of every other axis on its own move
-        self._others, there, back = [], [], []
+        there, back, to, per_band = [], [], [], []
         for i in others:
             wanted = wave.move(moves[i])
             drive = servos[i].reference_gain(s) * wave.spectrum(wanted)
-            begin = int(np.searchsorted(wave.time, moves[i].duration))
             for what in (closed, loads):
                 there.append(what[:, i, i] * drive)
                 back.append(what[:, i, axis] * closed[:, axis, i] * drive)
-                self._others.append((wanted[begin:], begin, INNER_BAND * moves[i].settling_band))
+                to.append(wanted)
+                per_band.append(after[i] / (INNER_BAND * moves[i].settling_band))
         shape = (len(there), wave.omega.size)
+        self._others = np.array([to, per_band]).reshape(2, len(to), wave.samples)
+        """Where the others are to be, and one over their band once they should be there; (2, K, N)."""
         self._there = np.array(there, dtype=np.complex128).reshape(shape)
         self._back = np.array(back, dtype=np.complex128).reshape(shape)
 
@@ -149,28 +154,24 @@ class AxisMotion:
         Shares are those of least squares over the time after the move, and a little before it: of
         velocity, inertia, and where there is such a feed-forward, friction over the velocity's P.
         """
-        wave, drive = self._wave, self._target * sensitivity
-        parts = [pi * servo.loop.position_p * drive]
-        parts.append(pi * self._slow.s * drive)
-        parts.append(torque * self._slow.acceleration * drive * self.mass)
         loop = servo.loop
+        gains = [pi * loop.position_p, pi, torque]
         known = [loop.velocity_ff, loop.inertia_ff / self.mass]
         if self.fed.friction or loop.viscous_ff:
-            parts.append(torque * self._slow.s * drive * loop.velocity_p)
+            gains.append(torque * loop.velocity_p)
             known.append(loop.viscous_ff / loop.velocity_p)
-        spectra = self._plants[:, None, :] * np.stack(parts)
+        parts = self._targets[: len(gains)] * gains * sensitivity
+        spectra = self._plants[:, None, :] * parts
         if self._drag is not None:
             spectra[:, 0] += self._drag * sensitivity
-        signals = wave.signal(spectra)
+        signals = self._wave.signal(spectra)
         signals[:, 0] -= self._wanted
         seen = signals * self._weight
         most = np.array([1.0, self._most_inertia, MOST_FED * self.fed.viscous / loop.velocity_p])
         count = len(known)
         best = _least_squares(seen, np.array(known), self._free[:count], most[:count])
-        errors, phasors = signals[:, 0], parts[0]
-        for k, share in enumerate(best, 1):
-            errors, phasors = errors + share * signals[:, k], phasors + share * parts[k]
-        return best, errors, phasors
+        shares = np.array([1.0, *best])
+        return best, shares @ signals, shares @ parts
 
     def _most_inertia_of(self, servo: Servo) -> float:
         """Return the largest share of inertia: targets are rounded to encoder steps."""
@@ -186,18 +187,16 @@ class AxisMotion:
         wave, sensitivity = self._wave, 1 / (1 + gain * self._motor)
         _, errors, phasors = self._feed_forward(servo, sensitivity, torque, pi)
         band = INNER_BAND * self.move.settling_band
-        count = MOVED * _outside(errors[:, self._begin :], band)
+        total = MOVED * _outside(errors * self._per_band)
         follow = gain * sensitivity
         spectra = np.concatenate(
             [self._plants * (self._step * sensitivity), self._there - self._back * follow]
         )
         moved = wave.signal(spectra)
         energies = (moved[:2] ** 2).sum(axis=1) * self._tick / band**2
-        total = count + STIFFNESS * self.move.duration / self._tick * float(
-            np.log(energies + 1e-12).sum()
-        )
-        for signal, (wanted, begin, other_band) in zip(moved[2:], self._others, strict=True):
-            total += _outside(signal[begin:] - wanted, other_band)
+        total += STIFFNESS * self.move.duration / self._tick * float(np.log(energies + 1e-12).sum())
+        wanted, per_band = self._others
+        total += _outside((moved[2:] - wanted) * per_band)
         if self._drag is not None:  # the loop works against friction too
             phasors = phasors - self._drag[0] * follow
         return 0.5 * self._tick * total, float(np.abs(wave.signal(phasors)).max())
@@ -215,38 +214,39 @@ def _least_squares(
     known
         Shares of the columns where nothing better is found, shape (n,).
     """
-    products = np.einsum("pin,pjn->ij", seen, seen)
+    products = np.matmul(seen, seen.swapaxes(1, 2)).sum(axis=0)
     normal, base = products[1:, 1:], products[1:, 0]
+    chosen = free & (most > 0)
     best = np.where(free, np.clip(known, 0.0, most), known)
-    chosen = np.flatnonzero(free & (most > 0))
-    for k in np.tile(chosen, chosen.size):
-        rest = base[k] + normal[k] @ best - normal[k, k] * best[k]
-        best[k] = float(np.clip(-rest / max(float(normal[k, k]), 1e-300), 0.0, most[k]))
-    inside = chosen
-    if chosen.size > 2:
-        inner = _alone(normal, base, best, chosen)
-        inside = chosen[(inner > 0) & (inner < most[chosen])]
-    if inside.size > 1:
-        inner = _alone(normal, base, best, inside)
-        if np.all((inner >= 0) & (inner <= most[inside])):
-            best[inside] = inner
+    right = -base - normal[:, ~chosen] @ best[~chosen]
+    ridge = 1e-12 * max(float(np.trace(normal)), 1e-290) * np.eye(most.size)
+    inner = (normal + ridge)[chosen][:, chosen]
+    best[chosen] = _bounded(inner, right[chosen], most[chosen])
     return best
 
 
-def _alone(
-    normal: FloatArray, base: FloatArray, best: FloatArray, chosen: NDArray[np.int_]
-) -> FloatArray:
-    """Return the shares that are best without their bounds, those that are not chosen held."""
-    held = np.delete(np.arange(best.size), chosen)
-    matrix = normal[np.ix_(chosen, chosen)]
-    right = base[chosen] + normal[np.ix_(chosen, held)] @ best[held]
-    step = 1e-12 * np.trace(matrix) * np.eye(chosen.size)
-    return np.asarray(np.linalg.solve(matrix + step, -right))
+def _bounded(matrix: FloatArray, right: FloatArray, most: FloatArray) -> FloatArray:
+    """Return the x between 0 and its bounds with the least x' A x / 2 - b' x.
+
+    Where the least of all x breaks bounds, that within them lies on at least one of these.
+    """
+    x = np.asarray(np.linalg.solve(matrix, right), dtype=np.float64)
+    nearest = np.clip(x, 0.0, most)
+    broken = np.flatnonzero(x != nearest)
+    if not broken.size:
+        return x
+    tried = []
+    for k, end in zip(broken, nearest[broken], strict=True):
+        rest = np.arange(x.size) != k
+        one = np.full(x.size, end)
+        moved = right[rest] - end * matrix[rest, k]
+        one[rest] = _bounded(matrix[rest][:, rest], moved, most[rest])
+        tried.append(one)
+    return min(tried, key=lambda one: float(one @ (0.5 * matrix @ one - right)))
 
 
-def _outside(error: FloatArray, band: float) -> float:
-    """Return a smooth count of the samples outside of a band."""
-    fourth = error / band
-    fourth *= fourth
+def _outside(bands: FloatArray) -> float:
+    """Return a smooth count of the samples outside of a band, of errors over it."""
+    fourth = bands * bands
     fourth *= fourth
     return float((fourth / (fourth + 1)).sum())

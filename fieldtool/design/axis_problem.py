@@ -90,12 +90,13 @@ class AxisProblem:
         ratio = opened / self._reference
         turned = np.angle(ratio[:, 1:] * np.conj(ratio[:, :-1])).sum(axis=1)
         inverse = 1 / opened
-        peak = float(np.abs(inverse).max())
+        own = np.abs(inverse)
+        peak = float(own.max())
         if np.abs(turned).max() > 1.0 or not isfinite(peak):
             return UNSTABLE * (1 + min(peak, 1e3)), np.inf
         follow = gain * inverse
-        sizes = [np.abs(inverse)]
-        sizes += [np.abs(a + b * follow) for a, b in zip(self._own, self._cross, strict=True)]
+        cross = zip(self._own, self._cross, strict=True)
+        sizes = [own, *(np.abs(a + b * follow) for a, b in cross)]
         excess = max(float(size.max()) for size in sizes) / self.bounds.sensitivity - 1
         for size, below in zip(sizes, self._held, strict=True):
             if below is not None:

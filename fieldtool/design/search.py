@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.optimize import minimize
@@ -42,9 +43,9 @@ class Space:
     """rad/s, of filters."""
     highest: float
 
-    @property
-    def bounds(self) -> list[tuple[float, float]]:
-        """Of the vector's entries; the logarithm of what is above 0."""
+    @cached_property
+    def bounds(self) -> tuple[FloatArray, FloatArray]:
+        """Lowest and highest of the vector's entries; the logarithm of what is above 0."""
         side, log = self.side, np.log
         out = [self._range("position_p"), self._range("velocity_p")]
         out.append((float(log(INTEGRAL[0])), float(log(INTEGRAL[1]))))
@@ -58,7 +59,8 @@ class Space:
             if kind == NOTCH:
                 out.append((float(log(DEPTH[0])), float(log(DEPTH[1]))))
             out.append((float(log(POLE_DAMPING[0])), float(log(POLE_DAMPING[1]))))
-        return [(float(a), float(b)) for a, b in out]
+        low, high = np.array(out, dtype=np.float64).T
+        return low, high
 
     def _range(self, name: str) -> tuple[float, float]:
         """Return the logarithm of what the drive holds."""
@@ -87,32 +89,28 @@ class Space:
             if kind == NOTCH:
                 out.append(np.log(max(biquad.numerator[1] / d1, DEPTH[0])))
             out.append(np.log(d1 / (2 * w)))
-        low, high = np.array(self.bounds).T
-        return np.clip(np.array(out, dtype=np.float64), low, high)
+        return np.clip(np.array(out, dtype=np.float64), *self.bounds)
 
     def servo(self, x: FloatArray, template: Servo) -> Servo:
         """Return the controller of a vector; what is not varied is that of ``template``."""
         side = self.side
-        low, high = np.array(self.bounds).T
-        rest = list(np.clip(x, low, high))
-        position, velocity, ratio = np.exp(rest[:3])
-        rest = rest[3:]
+        position, velocity, ratio, *rest = np.exp(np.clip(x, *self.bounds)).tolist()
         corner = template.velocity_filter
         if side.has("velocity_filter"):
-            corner = float(np.exp(rest.pop(0))) / (2 * np.pi)
+            corner = rest.pop(0) / (2 * np.pi)
         filters = []
         for kind in self.slots:
-            f = float(np.exp(rest.pop(0))) / (2 * np.pi)
+            f = rest.pop(0) / (2 * np.pi)
             if kind == NOTCH:
-                depth, pole = float(np.exp(rest.pop(0))), float(np.exp(rest.pop(0)))
+                depth, pole = rest.pop(0), rest.pop(0)
                 filters.append(Biquad.notch(f, depth * pole, pole))
             else:
-                filters.append(Biquad.low_pass(f, float(np.exp(rest.pop(0)))))
+                filters.append(Biquad.low_pass(f, rest.pop(0)))
         loop = replace(
             template.loop,
-            position_p=float(position),
-            velocity_p=float(velocity),
-            velocity_i=float(ratio * velocity * position),
+            position_p=position,
+            velocity_p=velocity,
+            velocity_i=ratio * velocity * position,
             filters=tuple(filters) if side.filters else template.loop.filters,
         )
         return Servo(loop, corner, template.timing)
@@ -145,7 +143,7 @@ def improve(problem: AxisProblem, best: Best, evaluations: int, spread: float = 
         return problem.cost(space.servo(x, template))
 
     corners = np.vstack([start, start + spread * _directions(start.size)])
-    low, high = np.array(space.bounds).T
+    low, high = space.bounds
     found = minimize(
         cost,
         start,

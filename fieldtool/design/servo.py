@@ -133,7 +133,7 @@ class Servo:
         if self.velocity_filter != OFF:
             share = -np.expm1(-2 * np.pi * self.velocity_filter * period)
             velocity = rate * share / (1 - (1 - share) * np.exp(-period * s))
-        gain = self._torque(s) * self.loop.velocity_p * (self.loop.position_p + velocity)
+        gain = self.loop.filtered(s) * self.loop.velocity_p * (self.loop.position_p + velocity)
         power = np.trapezoid(np.abs(gain) ** 2, omega) / nyquist
         return float(resolution / np.sqrt(12) * np.sqrt(power))
 

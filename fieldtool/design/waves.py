@@ -25,7 +25,7 @@ class HalfWave:
     duration: float
     """s, half a period."""
     samples: int
-    """N, even."""
+    """N, a multiple of 4."""
 
     @cached_property
     def time(self) -> FloatArray:
@@ -42,14 +42,27 @@ class HalfWave:
         return np.fft.fft(signal * np.conj(self._twist))[: self.samples // 2]
 
     def signal(self, spectrum: ComplexArray) -> FloatArray:
-        """Return the signal of phasors, shape (..., N / 2) or fewer (the others are 0), as (..., N)."""
-        twisted = np.fft.ifft(spectrum, self.samples)
-        twisted *= self._twist
-        return np.asarray(2 * twisted.real)
+        """Return the signal of phasors, shape (..., N / 2), as (..., N).
+
+        One transform of N / 2 gives both halves: x(t) + j x(t + T) holds odd harmonics with twice their
+        phasor at positive frequencies (T turns them by -j) or at negative ones, conjugated (by +j).
+        """
+        half, quarter = self.samples // 2, self.samples // 4
+        folded = np.empty((*spectrum.shape[:-1], half), dtype=np.complex128)
+        folded[..., :quarter] = spectrum[..., 1::2]
+        np.conjugate(spectrum[..., ::2], out=folded[..., : quarter - 1 : -1])
+        halves = np.fft.ifft(folded)
+        halves *= self._turn
+        return np.concatenate([halves.real, halves.imag], axis=-1)
 
     @cached_property
     def _twist(self) -> ComplexArray:
         return np.asarray(np.exp(1j * np.pi * np.arange(self.samples) / self.samples))
+
+    @cached_property
+    def _turn(self) -> ComplexArray:
+        """Of the transform's lowest frequency, the third harmonic."""
+        return self._twist[: self.samples // 2] ** 3
 
     def move(self, move: TestMove) -> FloatArray:
         """Return the reference of a move about its middle, from minus to plus half the distance."""

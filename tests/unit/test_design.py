@@ -11,7 +11,7 @@ import yaml
 from scipy.linalg import solve_continuous_lyapunov
 
 from fieldtool.design.axis_problem import AxisProblem
-from fieldtool.design.decide import design
+from fieldtool.design.decide import KEPT, design
 from fieldtool.design.design import find
 from fieldtool.design.drive_side import GAINS, DriveSide, Hold
 from fieldtool.design.loops import Loops, system_matrix
@@ -169,17 +169,27 @@ def test_an_axis_that_keeps_its_own_is_not_made_worse_by_the_others(
         assert arrival(new) <= 1.05 * arrival(was)
 
 
-def test_an_axis_whose_drive_is_too_coarse_keeps_its_own(random_model: RandomModel) -> None:
-    model = random_model(np.random.default_rng(8), (2, 1))
-    sides = sides_of(model, [Servo(loop) for loop in rule(model)])
-    best = dict(sides[0].present or {})
-    coarse = {"velocity_p": Hold(40.0 * best["velocity_p"], whole=True, low=1, high=9)}
-    sides[0] = replace(sides[0], holds=coarse)
-    tuning = design(model, sides)
-    assert tuning.axes[0].parameters == {n: best[n] for n in tuning.axes[0].parameters}
-    assert tuning.axes[1].parameters["velocity_p"] != (sides[1].present or {})["velocity_p"]
-    assert any(note.startswith("axis1: nothing better") for note in tuning.notes)
-    assert tuning.bound == pytest.approx(1.7)
+def test_an_axis_whose_drive_is_too_coarse_keeps_its_own(
+    random_model: RandomModel, fresh_rng: np.random.Generator
+) -> None:
+    """The other one is designed anew, unless each way to do so would make this one worse."""
+    changed = False
+    for _ in range(6):
+        model = random_model(fresh_rng, (2, 1))
+        sides = sides_of(model, [Servo(loop) for loop in rule(model)])
+        best, other = (dict(side.present or {}) for side in sides)
+        coarse = {"velocity_p": Hold(40.0 * best["velocity_p"], whole=True, low=1, high=9)}
+        sides[0] = replace(sides[0], holds=coarse)
+        try:
+            tuning = design(model, sides)
+        except DesignError:
+            continue  # the rule's gains do not keep the margin either
+        assert tuning.axes[0].parameters == {n: best[n] for n in tuning.axes[0].parameters}
+        assert any(note.startswith("axis1") and KEPT in note for note in tuning.notes)
+        assert tuning.bound == pytest.approx(1.7)
+        if changed := tuning.axes[1].parameters["velocity_p"] != other["velocity_p"]:
+            break
+    assert changed
 
 
 def test_a_softer_response_is_not_forced_on_an_axis_that_is_within_the_bound(
