@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fieldtool.design.grids import Bounds, ComplexArray, Grids, closed_compliance, without
+from fieldtool.design.machine import standing
 from fieldtool.design.moves import TestMove
 from fieldtool.design.servo import Sampled, Servo
 from fieldtool.records.model import FloatArray
@@ -72,21 +73,21 @@ class AxisMotion:
         others = [i for i in range(len(servos)) if i != axis]
         wave, s = grids.wave, 1j * grids.wave.omega
         self._wave, self._tick = wave, wave.duration / wave.samples
-        slow = self._slow = Sampled.of(s, servos[axis].timing)
+        at = self._slow = Sampled.of(s, servos[axis].timing)
         gains = without(np.stack([servo.gain(s) for servo in servos], axis=-1), axis)
         closed = closed_compliance(grids.slow, gains)
         loads = grids.loads - np.einsum("wij,wj,wjk->wik", grids.loads, gains, closed)
         self._motor = closed[:, axis, axis]
         self._plants = np.stack([self._motor, loads[:, axis, axis]])
         target = wave.spectrum(wave.move(self.move))
-        self._targets = target * np.stack([np.ones_like(s), s, slow.acceleration * self.mass, s])
+        self._targets = target * np.stack([np.ones_like(s), s, at.acceleration * self.mass, s])
         """Of the move: position, velocity, what inertia feed-forward gives, velocity again."""
         self._step = wave.spectrum(wave.step(DISTURBANCE * self.mass * self.move.acceleration))
         self._wanted = wave.move(self.move)
-        friction = self._friction(grids, axis)
-        self._drag = self._dragged(friction, (axis, closed, loads))
+        slow = self._friction(grids, axis) + self._pulled(grids, axis)
+        self._drag = self._dragged(slow, (axis, closed, loads))
         _, _, acceleration = self.move.at(wave.time)
-        least = float(np.abs(self.mass * acceleration + friction).max())
+        least = float(np.abs(self.mass * acceleration + slow).max())
         self.most_torque = bounds.torque if least <= bounds.torque else ROOM * least
         """Of the move, N m or N."""
         after = [wave.time >= move.duration for move in moves]
@@ -119,18 +120,30 @@ class AxisMotion:
         moving = np.sign(np.round(self.move.at(wave.time)[1] / self.move.velocity, 9))
         return np.asarray(torque * moving)
 
-    def _dragged(
-        self, friction: FloatArray, inner: tuple[int, ComplexArray, ComplexArray]
-    ) -> ComplexArray | None:
-        """Return what the axis' dry friction does to motor and last mass before its loop is closed.
+    def _pulled(self, grids: Grids, axis: int) -> FloatArray:
+        """Return what goes with the position on the reference, about its mean of the ends, N m or N."""
+        machine = standing(grids.machines[0], [self.move.start] * len(grids.machines[0].names))
+        way = self.move.at(grids.wave.time)[0]
+        torque = np.zeros_like(way)
+        for pull in machine.pulls:
+            if machine.axis_of(pull.place) == axis:
+                ends = pull.at(np.array([0.0, self.move.distance]))
+                torque += pull.at(way) - ends.mean()
+        return torque
 
-        As a torque against the direction of the reference's velocity: what an integrator has to learn
-        when the move begins, and to forget when it ends.  None where there is none.
+    def _dragged(
+        self, torque: FloatArray, inner: tuple[int, ComplexArray, ComplexArray]
+    ) -> ComplexArray | None:
+        """Return what slow torques do to motor and last mass before the axis' loop is closed.
+
+        Those of dry friction, against the direction of the reference's velocity: what an integrator has
+        to learn when the move begins, and to forget when it ends; and those that go with the position,
+        which it learns for good.  None where there are none.
         """
         axis, closed, loads = inner
-        if not friction.any():
+        if not torque.any():
             return None
-        force = self._wave.spectrum(-friction)
+        force = self._wave.spectrum(-torque)
         return np.stack([closed[:, axis, axis] * force, loads[:, axis, axis] * force])
 
     def fed_forward(self, servo: Servo) -> Servo:
@@ -197,7 +210,7 @@ class AxisMotion:
         total += STIFFNESS * self.move.duration / self._tick * float(np.log(energies + 1e-12).sum())
         wanted, per_band = self._others
         total += _outside((moved[2:] - wanted) * per_band)
-        if self._drag is not None:  # the loop works against friction too
+        if self._drag is not None:  # the loop works against these too
             phasors = phasors - self._drag[0] * follow
         return 0.5 * self._tick * total, float(np.abs(wave.signal(phasors)).max())
 

@@ -203,7 +203,7 @@ def _tuning(result: _Result, response: str) -> Tuning:
     axes = []
     now = task.present
     present = predicted(task, now, spread=False) if now else None
-    notes = list(notes_of(task.model, servos))
+    notes = list(notes_of(task.model, servos, task.moves))
     if result.instead:
         notes.append(
             f"A {response} response that is nowhere slower can not be had within its margin on all "

@@ -5,7 +5,7 @@ measured can only be compared with what the same excitation does by the model, f
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -88,6 +88,7 @@ def excited(
     torque = sent.signals(torques[:, [axis]])[:, 0]
     if not machine.dry:
         return position, torque
+    machine = replace(machine, pulls=())  # about the same all over a small motion
     speeds = s[:, None] * rubbing(machine, loops.response, motors, torques)
     velocities = np.tile(sent.signals(speeds, finer), (PERIODS, 1))
     added = dragged(machine, servos, axis, sent.step / finer, velocities)

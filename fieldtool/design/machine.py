@@ -1,7 +1,7 @@
 """The elastic machine with its linear effects, and its response to motor torques and load forces."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,8 @@ from fieldtool.records.model import FloatArray, MachineModel
 
 ComplexArray = NDArray[np.complexfloating[Any, Any]]
 DRY = ("coulomb_friction", "stribeck_friction", "asymmetric_friction")
+PULLS = {"cogging": "amplitude", "gravity": "torque"}
+"""Largest torque or force, by its name, of what goes with the position."""
 RIGID = 1e-9
 """Of the largest eigenvalue: below it a mode is rigid motion."""
 SINGULAR = 1e-12
@@ -33,6 +35,24 @@ class Dry:
     """What breakaway takes more than sliding."""
     velocity: float = 1.0
     """At which that has fallen to 1 / e of it, rad/s or m/s."""
+
+
+@dataclass(frozen=True)
+class Pull:
+    """What goes with the position q of a mass, and its motor holds: ``torque sin(order q + phase)``."""
+
+    place: int
+    """Degree of freedom."""
+    torque: float
+    """N m or N."""
+    order: float
+    """rad of phase per rad or m."""
+    phase: float
+    """rad."""
+
+    def at(self, position: FloatArray) -> FloatArray:
+        """Return the torque or force at positions, shape of ``position``."""
+        return np.asarray(self.torque * np.sin(self.order * position + self.phase))
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +78,17 @@ class Machine:
     """(M,) s: by which a position is measured later than torque."""
     dry: tuple[Dry, ...] = ()
     """Dry friction, which no response in frequency has."""
+    pulls: tuple[Pull, ...] = ()
+    """Gravity and cogging, which none has either."""
+
+    @property
+    def places(self) -> list[int]:
+        """Degrees of freedom of what is dry, then of what pulls."""
+        return [dry.place for dry in self.dry] + [pull.place for pull in self.pulls]
+
+    def axis_of(self, place: int) -> int:
+        """Return the axis whose motor or last mass a degree of freedom is."""
+        return int(np.flatnonzero((self.motors == place) | (self.loads == place))[0])
 
     @property
     def inertias(self) -> FloatArray:
@@ -128,7 +159,26 @@ def machine_of(model: MachineModel) -> Machine:
         np.maximum(parts.of_axis("torque_lag", "time", 0.0, m), 0.0),
         np.maximum(parts.of_axis("measurement_delay", "delay", 0.0, m), 0.0),
         tuple(dry for effect in model.effects if (dry := _dry(model, effect)) is not None),
+        tuple(pull for effect in model.effects if (pull := _pull(model, effect)) is not None),
     )
+
+
+def standing(machine: Machine, at: Sequence[float | None]) -> Machine:
+    """Return a machine whose positions count from where its axes stand.
+
+    Parameters
+    ----------
+    machine
+        As the drives tell positions.
+    at
+        Position of each axis, rad or m; None: not known, and what goes with it is left out.
+    """
+    pulls = []
+    for pull in machine.pulls:
+        where = at[machine.axis_of(pull.place)]
+        if where is not None:
+            pulls.append(replace(pull, phase=pull.phase + pull.order * where))
+    return replace(machine, pulls=tuple(pulls))
 
 
 def is_machine(model: MachineModel) -> bool:
@@ -177,6 +227,23 @@ def _dry(model: MachineModel, effect: Mapping[str, Any]) -> Dry | None:
         return None
     place = int(places[model.names.index(str(name))])
     return Dry(place, forward, backward, extra, velocity if velocity > 0 else 1.0)
+
+
+def _pull(model: MachineModel, effect: Mapping[str, Any]) -> Pull | None:
+    """Return what an effect's torque is by position; None where it does not go with it."""
+    kind, name = effect.get("effect"), effect.get("axis")
+    if kind not in PULLS or name not in model.names:
+        return None
+    axis = model.names.index(str(name))
+    if kind == "gravity" and model.axes[axis].kind == "linear":
+        return None  # a weight is the same everywhere
+    places = model.last_masses if effect.get("location") == "load" else model.first_masses
+    return Pull(
+        int(places[axis]),
+        number(effect, PULLS[kind]),
+        number(effect, "order", 1.0),
+        number(effect, "phase"),
+    )
 
 
 def respond(machine: Machine, omega: FloatArray) -> Response:

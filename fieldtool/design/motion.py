@@ -1,4 +1,4 @@
-"""A move and a step in time: from the response in frequency, and dry friction where there is any."""
+"""A move and a step in time: from the response in frequency, with dry friction and weights beside it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
@@ -38,7 +38,7 @@ class Curves:
     position: FloatArray
     """Motor."""
     back: FloatArray
-    """Motor on the way back, told as if it were the way out: another one with dry friction alone."""
+    """Motor on the way back, told as if it were the way out: another one with friction or weights."""
     load: FloatArray
     """Last mass."""
     torque: FloatArray
@@ -66,12 +66,12 @@ class Moved:
     motor: MoveFigures
     load: MoveFigures
     step: StepFigures
-    """Without dry friction."""
+    """Without dry friction and weights."""
     peak_torque: float
     curves: Curves
     beside: FloatArray
     """Largest torque, distance and speed of every axis' motor on this move, (3, M): of those whose
-    references stand still; without dry friction, which holds them back."""
+    references stand still; without dry friction, which holds them back, and weights."""
 
 
 def moved(
@@ -83,13 +83,13 @@ def moved(
 ) -> Moved:
     """Return what an axis does on its move; the references of the others stand still.
 
-    With dry friction it moves out and back, and figures are the worse ones of both: before it goes back
-    the integrator holds what friction left of the move out.
+    With dry friction, or torques that go with the position, it moves out and back, and figures are the
+    worse ones of both: before it goes back the integrator holds what friction left of the move out.
 
     Parameters
     ----------
     machine, servos
-        Loops closed; stable.
+        Loops closed; stable.  Positions count from where the axes stand.
     axis
         Index.
     move
@@ -112,9 +112,9 @@ def moved(
     half, time = 0.5 * move.distance, wave.time
     reference = move.at(time)[0]
     ways = [(motors[axis] + half, load + half, torques[axis])]
-    if machine.dry:
+    if machine.dry or machine.pulls:
         rubbed = rubbing(machine, loops.response, *phasors)
-        ways = _dragged_ways(machine, servos, axis, wave, rubbed, ways[0])
+        ways = _dragged_ways(machine, servos, axis, wave, rubbed, half, ways[0])
     (motor, last, torque), back = ways[0], ways[-1][0]
     curves = Curves(time, reference, motor, back, last, torque, time, stepped)
     band = move.settling_band
@@ -135,15 +135,26 @@ def _dragged_ways(
     axis: int,
     wave: HalfWave,
     rubbed: ComplexArray,
+    half: float,
     way: tuple[FloatArray, FloatArray, FloatArray],
 ) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
-    """Return motor, last mass and torque of the way out and of that back, friction included.
+    """Return motor, last mass and torque of the way out and of that back, friction and weights included.
 
-    The way back is told as if it were a way out.
+    The way back is told as if it were a way out; ``half`` is half the way.
     """
-    out = np.column_stack([wave.signal(1j * wave.omega * one) for one in rubbed.T])
+    dry = len(machine.dry)
+    out = wave.signal(1j * wave.omega * rubbed.T[:dry]).T
+    path = wave.signal(rubbed.T[dry:]).T
+    middle = np.array([half * (machine.axis_of(pull.place) == axis) for pull in machine.pulls])
     step = wave.duration / wave.samples
-    added = dragged(machine, servos, axis, step, np.concatenate([out, -out]))
+    added = dragged(
+        machine,
+        servos,
+        axis,
+        step,
+        np.concatenate([out, -out]),
+        np.concatenate([middle + path, middle - path]),
+    )
     n = wave.samples
     motor, load, torque = way
     first = (motor + added.motor[:n], load + added.load[:n], torque + added.torque[:n])

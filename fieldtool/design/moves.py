@@ -31,7 +31,7 @@ class TestMove:
     Raises
     ------
     ValueError
-        If a bound is not above 0, or the distance is 0 or no number.
+        If a bound is not above 0, the distance is 0, or one is no number.
     """
 
     __test__ = False
@@ -48,6 +48,8 @@ class TestMove:
     band: float = 0.0
     """rad or m to both sides of the target within which the axis has arrived; 0: a hundredth of the
     distance."""
+    start: float | None = None
+    """rad or m: where the axis stands before, as its drive tells; None: not known."""
 
     def __post_init__(self) -> None:
         for name in ("velocity", "acceleration", "jerk"):
@@ -56,6 +58,8 @@ class TestMove:
                 raise ValueError(f"{self.axis}: {name} of a move must be above 0, got {value}")
         if not isfinite(self.distance) or self.distance == 0:
             raise ValueError(f"{self.axis}: the distance of a move is {self.distance}")
+        if self.start is not None and not isfinite(self.start):
+            raise ValueError(f"{self.axis}: a move that starts at {self.start}")
         if not (isfinite(self.band) and self.band >= 0):
             raise ValueError(f"{self.axis}: the band of a move is {self.band}")
 

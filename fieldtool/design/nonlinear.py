@@ -3,15 +3,13 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from fieldtool.design.machine import DRY, number
+from fieldtool.design.machine import DRY, PULLS, number
+from fieldtool.design.moves import TestMove
 from fieldtool.design.servo import Servo
 from fieldtool.records.model import MachineModel
 
-PULLS = {"cogging": "amplitude", "gravity": "torque"}
-"""Largest torque or force, by its name, of what changes with the position."""
 
-
-def notes_of(model: MachineModel, servos: Sequence[Servo]) -> list[str]:
+def notes_of(model: MachineModel, servos: Sequence[Servo], moves: Sequence[TestMove]) -> list[str]:
     """Return what the model's effects mean for the designed loops, a sentence each.
 
     Dry friction holds a motor up to its torque over the loop's stiffness away from the target until
@@ -30,7 +28,9 @@ def notes_of(model: MachineModel, servos: Sequence[Servo]) -> list[str]:
             notes += _friction(name, effect, servo, unit, torque_unit)
         elif kind in PULLS and (rotary or kind != "gravity"):
             size = abs(number(effect, PULLS[kind]))
-            notes.append(_pull(name, f"{kind} of {size:.3g} {torque_unit}", size, servo, unit))
+            start = moves[model.names.index(name)].start
+            what = f"{kind} of {size:.3g} {torque_unit}"
+            notes.append(_pull(name, what, size, servo, unit, start))
         elif kind == "backlash":
             gap = number(effect, "gap") or 2 * number(effect, "half_gap")
             notes.append(
@@ -68,14 +68,17 @@ def _friction(
     ]
 
 
-def _pull(name: str, what: str, size: float, servo: Servo, unit: str) -> str:
+def _pull(name: str, what: str, size: float, servo: Servo, unit: str, start: float | None) -> str:
     loop = servo.loop
     time = ""
     if loop.velocity_i > 0:
         time = f" for about {loop.velocity_p / loop.velocity_i:.2g} s after a move"
+    known = "does not have it, for it is not known where they start"
+    if start is not None:
+        known = f"has it in, for moves that start at {start:.4g} {unit}"
     return (
         f"{name}: {what} may pull the motor up to {_away(servo, size):.3g} {unit} off its target{time}; "
-        "what is predicted of moves does not have it. Where that is too far, a loop that gives way "
+        f"what is predicted of moves {known}. Where that is too far, a loop that gives way "
         "less holds it better: compare the compliance of the responses (`fieldtool design FOLDER "
         "--compare`) and of the present parameters."
     )

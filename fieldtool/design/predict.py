@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from fieldtool.design.figures import MoveFigures, StepFigures, sensitivity_peak
 from fieldtool.design.loops import Loops, system_matrix
-from fieldtool.design.machine import Machine, machine_of, respond
+from fieldtool.design.machine import Machine, machine_of, respond, standing
 from fieldtool.design.margins import Margins, margins_of
 from fieldtool.design.motion import Curves, moved
 from fieldtool.design.moves import TestMove
@@ -123,7 +123,8 @@ def predict(
     Parameters
     ----------
     model
-        The machine, effects included where they are linear.
+        The machine, effects included where they are linear, dry friction, and gravity and cogging where
+        it is known from where a move starts.
     servos, moves
         One an axis, in the model's order.
     resolutions
@@ -132,6 +133,7 @@ def predict(
         Models that are as likely as ``model``; the spread is that over them.
     """
     machine = model if isinstance(model, Machine) else machine_of(model)
+    machine = standing(machine, [move.start for move in moves])
     servos = tuple(servos)
     steps = [nan] * len(servos) if resolutions is None else list(resolutions)
     values: ComplexArray = np.linalg.eigvals(system_matrix(machine, servos)).astype(np.complex128)

@@ -34,6 +34,7 @@ class _Move(StrictModel):
     acceleration: Number
     jerk: Number
     band: Number = 0.0
+    start: Number | None = None
 
 
 class _AxisPrediction(StrictModel):

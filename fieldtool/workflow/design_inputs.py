@@ -1,7 +1,7 @@
 """What a design needs to know of a machine's drives and axes, from its profile and session folder."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import inf, isfinite, nan, pi
 from pathlib import Path
 
@@ -27,14 +27,30 @@ SEEN = 20_000
 REAL_LARGEST = {"REAL32": 3.4e38, "REAL64": 1.7e308}
 
 
-def moves_of(machine: MachineProfile, model: MachineModel) -> tuple[TestMove, ...]:
+def moves_of(
+    machine: MachineProfile, model: MachineModel, recording: Path | None = None
+) -> tuple[TestMove, ...]:
     """Return the typical move of each axis: the profile's, or one that follows from the limits.
 
     A move follows the unit of the limits; it never takes more than the axis' torque limit allows a
-    rigid axis of the model's masses.
+    rigid axis of the model's masses.  It starts where the axis stood when a recording began.
     """
     masses = {axis.name: axis.total_mass for axis in model.axes}
-    return tuple(_move(axis, masses[axis.name]) for axis in machine.axes)
+    stood = {} if recording is None else _stood(recording)
+    return tuple(
+        replace(_move(axis, masses[axis.name]), start=stood.get(axis.name)) for axis in machine.axes
+    )
+
+
+def _stood(recording: Path) -> dict[str, float]:
+    """Return where each axis stood when a recording began, rad or m; of none where nobody knows."""
+    try:
+        with h5py.File(recording, "r") as file:
+            names = [str(group.attrs.get("name", key)) for key, group in file["axes"].items()]
+            first = next(iter(file["experiments"].values()))["position"][0]
+            return {n: float(at) for n, at in zip(names, first, strict=True) if isfinite(at)}
+    except (OSError, KeyError, ValueError, TypeError, StopIteration, IndexError):
+        return {}
 
 
 def _move(axis: AxisProfile, mass: float) -> TestMove:

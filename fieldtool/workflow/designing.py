@@ -86,7 +86,7 @@ def designed(
     tuning = design(
         model,
         drive_sides(folder, machine, machine.controller_cycle),
-        moves_of(machine, model),
+        moves_of(machine, model, folder.recording),
         response=response,
         bound=bound,
         top=_top(folder),

@@ -65,7 +65,7 @@ def free_move(drive: CanopenDrive, typical: TestMove) -> TestMove:
             "was moved or written. Move it away from the end of its travel."
         )
     band = max(typical.settling_band * way / abs(typical.distance), BAND_COUNTS * counts)
-    return replace(typical, distance=sign * way, band=band)
+    return replace(typical, distance=sign * way, band=band, start=at)
 
 
 @dataclass(frozen=True)

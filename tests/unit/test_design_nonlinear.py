@@ -2,6 +2,7 @@
 
 import pytest
 
+from fieldtool.design.moves import TestMove
 from fieldtool.design.nonlinear import notes_of
 from fieldtool.design.servo import Servo
 from fieldtool.records.closed_loop import AxisLoop
@@ -11,14 +12,21 @@ LOOP = AxisLoop(5.0, 80.0, 100.0, 1.0)
 """Holds with 500 N m/rad, and takes away in 0.8 s what pulls."""
 
 
-def told(effect: str, kind: str = "rotary", loop: AxisLoop = LOOP, **numbers: float) -> list[str]:
+def told(
+    effect: str,
+    kind: str = "rotary",
+    loop: AxisLoop = LOOP,
+    start: float | None = None,
+    **numbers: float,
+) -> list[str]:
     axis = AxisModel("x", kind, (Estimate(1.0),), (), ())
     one = {"effect": effect, "axis": "x", "location": "motor", "parameters": numbers}
-    return notes_of(MachineModel((axis,), effects=(one,)), [Servo(loop)])
+    moves = [TestMove("x", 1.0, 1.0, 1.0, 1.0, start=start)]
+    return notes_of(MachineModel((axis,), effects=(one,)), [Servo(loop)], moves)
 
 
 @pytest.mark.parametrize(("effect", "name"), [("cogging", "amplitude"), ("gravity", "torque")])
-def test_a_torque_that_goes_with_the_position_is_said_to_be_missing_in_predictions(
+def test_a_torque_that_goes_with_the_position_is_in_predictions_from_a_known_start(
     effect: str, name: str
 ) -> None:
     [note] = told(effect, **{name: -2.0})
@@ -26,6 +34,8 @@ def test_a_torque_that_goes_with_the_position_is_said_to_be_missing_in_predictio
         f"x: {effect} of 2 N m may pull the motor up to 0.004 rad off its target for about 0.8 s "
     )
     assert "what is predicted of moves does not have it" in note
+    [known] = told(effect, start=0.25, **{name: -2.0})
+    assert "what is predicted of moves has it in, for moves that start at 0.25 rad." in known
     [stays] = told(effect, loop=AxisLoop(5.0, 80.0, 0.0, 1.0), **{name: 2.0})
     assert "up to 0.005 rad off its target; what is predicted" in stays
 
