@@ -1,6 +1,7 @@
 """What a trial watches controllers by: as their parameters say, and how well they are known."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -16,6 +17,10 @@ from fieldtool.records.model import FloatArray
 
 UNSURE_LAG, UNSURE_CYCLES = 0.1, 0.05
 """Shares of a torque's lag that is known, and of a cycle, by which torques may be earlier or later."""
+SHORTEST_PERIOD = 0.0625e-3
+"""s, of loops whose period is not known, for the torque that the encoder's steps make, which grows as
+the period shrinks.  Velocity loops of 16 kHz are about the quickest; what still quicker ones make of a
+step is spread over the current loop's lag, which is hardly shorter."""
 QUARTER = 0.005
 """s: a first answer speeds up for so long, slows down and comes back for twice as long, and stops."""
 ANSWER, MOST_ANSWER, CLEAR = 0.05, 0.3, 10.0
@@ -34,6 +39,9 @@ def drive_loop(drive: CanopenDrive, servo: Servo) -> DriveLoop:
     unsure = UNSURE_CYCLES * timing.cycle + (
         UNSURE_LAG * timing.lag if known else max(timing.lag, CAUTIOUS_LAG)
     )
+    count, quick = abs(drive.scaling.position), servo
+    if profile.loop_period == UNKNOWN:
+        quick = replace(servo, timing=replace(timing, period=SHORTEST_PERIOD))
     return DriveLoop(
         servo.loop,
         servo.velocity_filter,
@@ -42,8 +50,8 @@ def drive_loop(drive: CanopenDrive, servo: Servo) -> DriveLoop:
         unsure,
         0.0 if profile.interpolation == "linear" else timing.cycle,
         0.0 if profile.loop_period != UNKNOWN else CAUTIOUS_PERIOD / 2,
-        servo.torque_noise(abs(drive.scaling.position)),
-        servo.count_torque(abs(drive.scaling.position)),
+        quick.torque_noise(count),
+        quick.count_torque(count),
         _why_not_told(drive),
     )
 

@@ -111,7 +111,10 @@ class IdentityWatch:
         late = np.array([loop.unsure for loop in loops])
         if learned is not None:
             late = late + LEARNED * learned.late
-        self._late = np.array([late + [loop.unsure_targets for loop in loops], late])
+        velocity = np.array([loop.unsure_velocity for loop in loops])
+        self._late = np.array([late + [loop.unsure_targets for loop in loops], late, velocity])
+        # where a period is not known, so much is late or early all the time
+        self._lasts = np.where(velocity > 0, 1 / LASTING - 1, 0.0)
         encoder = np.array([loop.noise for loop in loops])
         counts = COUNT * np.array([loop.count for loop in loops])
         self._floor = QUANTA * self._quanta + np.maximum(ENCODER * encoder, counts)
@@ -121,7 +124,7 @@ class IdentityWatch:
             encoder,
             np.array([loop.loop.position_p * self._step for loop in loops]),
             self._late[1],
-            np.array([loop.unsure_velocity for loop in loops]),
+            velocity,
             self._step,
             self._passed,
             None if learned is None else learned.gains,
@@ -213,7 +216,7 @@ class IdentityWatch:
         self._last = np.zeros((2, m))
         if self._gains is not None:
             self._gains.begin()
-        self._peak, self._slope = np.zeros(m), np.zeros((2, m))
+        self._peak, self._slope = np.zeros(m), np.zeros((3, m))
         self._over: list[FloatArray] = []
         self._squares: list[FloatArray] = []
         self._far: list[FloatArray] = []
@@ -232,7 +235,7 @@ class IdentityWatch:
         velocity = quick[BY_VELOCITY] - self._quick[BY_VELOCITY]
         both = np.stack([quick[FROM_REFERENCE].sum(axis=0), quick[FROM_POSITION].sum(axis=0)])
         changed, self._last = both - self._last, both
-        turns, slope = changed[1] / self._step, np.abs(changed) / self._step
+        turns, slope = changed[1] / self._step, np.abs([*changed, velocity]) / self._step
         self._before, self._quick = now, quick
         expected = both[0] + both[1]
         off = quick[-1] - expected
@@ -242,7 +245,8 @@ class IdentityWatch:
             self._moved += 1
         self._peak = np.maximum(np.abs(expected), self._kept * self._peak)
         self._slope = np.maximum(slope, self._kept * self._slope)
-        allowed = self._floor + SHARE * self._peak + (self._late * self._slope).sum(axis=0)
+        lateness = (self._late * self._slope).sum(axis=0)
+        allowed = self._floor + SHARE * self._peak + lateness
         if self._learned is None:
             allowed = allowed + STILL * self._still  # noise is no share of anything
         self._count += 1
@@ -255,7 +259,8 @@ class IdentityWatch:
         gains = [] if self._gains is None else self._gains.take(parts, off)
         self._compared += 1
         self._over = [*self._over[1 - OF :], difference / allowed]
-        capped = np.minimum(difference / (self._scale * allowed), ONE)
+        lasting = allowed + self._lasts * lateness
+        capped = np.minimum(difference / (self._scale * lasting), ONE)
         self._squares = [*self._squares[1 - LASTS :], capped**2]
         self._far = [*self._far[1 - OF :], difference]
         if len(self._over) < SEEN:
