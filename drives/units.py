@@ -31,7 +31,8 @@ UNITS: dict[str, dict[str, float]] = {
 }
 """Dimension: unit and its value in SI."""
 
-_QUANTITY = re.compile(r"\s*([-+]?(?:\d++\.?+\d*+|\.\d++)(?:[eE][-+]?\d++)?+)\s*+(\S.*?)\s*")
+_NUMBER = r"\s*([-+]?(?:\d++\.?+\d*+|\.\d++)(?:[eE][-+]?\d++)?+)\s*+"
+_QUANTITY = re.compile(_NUMBER + r"(\S.*?)\s*")
 """Number and unit; possessive, so that no digit of a bare number is taken for its unit."""
 
 
@@ -52,10 +53,11 @@ def parse_quantity(text: object, *dimensions: str) -> float:
     """
     known = {unit: factor for d in dimensions for unit, factor in UNITS[d].items()}
     wanted = f"a number with one of the units {', '.join(known)}"
-    if isinstance(text, int | float) and not isinstance(text, bool):
+    power = isinstance(text, str) and "e" in text.lower() and re.fullmatch(_NUMBER, text)
+    if power or (isinstance(text, int | float) and not isinstance(text, bool)):
         first, *others = known
         more = f" (or {', '.join(others)})" if others else ""
-        raise ValueError(f"{text} has no unit: write it with one, as {text} {first}{more}")  # noqa: TRY004
+        raise ValueError(f"{text} has no unit: write it with one, as {text} {first}{more}")
     if not isinstance(text, str):
         raise ValueError(f"needs {wanted}, got {text!r}")  # noqa: TRY004
     match = _QUANTITY.fullmatch(text)

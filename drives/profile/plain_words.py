@@ -40,6 +40,10 @@ _SYNTAX: tuple[tuple[str, str], ...] = (
     ),
 )
 """Part of a parser's complaint, and what it means."""
+_POWER = re.compile(
+    r"\s*([-+]?(?:\d{1,20}\.?\d{0,20}|\.\d{1,20}))e([-+]?)(\d{1,3})\s*", re.IGNORECASE
+)
+"""A power of ten; a text to YAML 1.1 but with a point and a sign, as 1.0e-3."""
 _OCTAL = re.compile(r"[-+]?0[0-7_]+")
 _PATTERNS = {
     r"^[A-Za-z][A-Za-z0-9_-]{0,31}$": "is a letter, then up to 31 letters, digits, _ or -, none with "
@@ -175,6 +179,10 @@ def problem_words(error: Mapping[str, Any], unit: str = "") -> str:
     shown = f", not {_shown(given)}" if isinstance(given, str | int | float | bool) else ""
     if isinstance(given, str) and kind.startswith(("float", "int")) and _COMMA.fullmatch(given):
         return f"a number is written with a point: {_pointed(given)}{shown}"
+    if isinstance(given, str) and kind.startswith(("float", "int")) and _POWER.fullmatch(given):
+        return (
+            f"{given.strip()} is text to YAML: write {_power(given, whole=kind.startswith('int'))}"
+        )
     if kind in ("tuple_type", "list_type"):
         example = f", such as [{given}]" if type(given) is int and abs(given) < 10**9 else ""
         return f"a list in brackets belongs here{example}"
@@ -218,6 +226,15 @@ def _shown(given: object) -> str:
     if isinstance(given, str) and len(given) > LONGEST_TEXT:
         return f"{given[:LONGEST_TEXT]!r} ..."
     return repr(given)
+
+
+def _power(text: str, *, whole: bool) -> str:
+    """Return a number of YAML 1.1 for a power of ten that is none to it."""
+    number, sign, power = _POWER.sub(r"\1 \2 \3", text).split(" ")
+    if whole and sign != "-" and int(power) < 10 and float(text).is_integer():
+        return f"{float(text):.0f}"
+    number = re.sub(r"^([-+]?)[.]", r"\g<1>0.", number if "." in number else f"{number}.0")
+    return f"{number}e{sign or '+'}{power}"
 
 
 def _pointed(text: str) -> str:

@@ -1,11 +1,12 @@
 """What is wrong with a profile, said as to a technician: axis by name, list, point, tab."""
 
 import pytest
+import yaml
 
 from drives.canopen_drive.group import profile_of
 from drives.errors import ProfileError
 from drives.profile import load_machine
-from drives.profile.plain_words import place_words, unit_of
+from drives.profile.plain_words import place_words, problem_words, unit_of
 
 GOOD = (
     "format: fieldtool-machine/1\nname: m\nbus: {interface: fieldsim, channel: x}\naxes:\n"
@@ -50,6 +51,11 @@ PROGRAMMERS = (
         ("[0.02, 0.025]", "[0.02, 1:30.5]", 16, "1:30.5 would be read to the base of 60"),
         ("    limits:", "    feed: 500 mm\n    limits:", 9,
          "feed: a number without a unit belongs here, in m per encoder revolution, not '500 mm'"),
+        ("springs: [190]", "springs: [190e1]", 17, "190e1 is text to YAML: write 190.0e+1."),
+        ("    limits:", "    torque_constant: 1e-3\n    limits:", 9,
+         "axis table, torque_constant: 1e-3 is text to YAML: write 1.0e-3."),
+        ("bus: {", "bus: {bitrate: 1e6, ", 3, "bus.bitrate: 1e6 is text to YAML: write 1000000."),
+        ("bus: {", "bus: {shortest_cycle: 1e-3, ", 3, "1e-3 has no unit: write it with one, as 1e-3 s"),
         ("springs: [190]", "springs: [190 N m/rad]", 17, "without a unit belongs here, in N m/rad, not"),
         ("springs: [190]", "springs: [stiff]", 17, "a number belongs here, in N m/rad, not 'stiff'"),
         ("bus: {", "bus: {bitrate: 500 kbit/s, ", 3, "number without a unit belongs here, in bit/s,"),
@@ -67,6 +73,15 @@ def test_a_fault_is_said_in_plain_words_with_its_line(tmp_path, old, new, line, 
     assert said in text
     assert text.startswith(f"{path}:{line}: ")
     assert not [word for word in PROGRAMMERS if word in text.removeprefix(str(path))]
+
+
+@pytest.mark.parametrize("text", ["1e-3", "1.5e3", "-.5E2", "2.e+1", "7e-10", " 3E0 "])
+def test_what_is_to_be_written_for_a_power_of_ten_is_that_number_to_yaml(text):
+    assert isinstance(yaml.safe_load(f"[{text}]")[0], str) or "+" in text
+    said = problem_words({"type": "float_type", "input": text, "loc": ()})
+    found = yaml.safe_load(said.split(" write ")[1])
+    assert isinstance(found, float)
+    assert found == float(text)
 
 
 def test_a_bare_number_of_a_linear_axis_is_said_in_its_units():
