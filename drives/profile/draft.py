@@ -173,8 +173,8 @@ def _behaviour(dictionary: ObjectDictionary) -> Iterator[str]:
     yield "# What the drive asks of SYNC (cycle times as `1 ms`), and what it does when one is missing."
     yield "sync: {shortest: unknown, longest: unknown, multiple: unknown, missing: unknown}"
     yield "interpolation: unknown   # linear: straight from one cyclic target to the next"
-    yield "# From torque reference to torque (current loop and half its step), where it is known:"
-    yield "#   torque_lag: 0.22 ms"
+    yield "# From torque reference to torque (current loop and half its step), such as 0.22 ms"
+    yield "torque_lag: unknown"
     yield "loop_period: unknown     # of position and velocity loop, such as 0.25 ms"
     offset = info_at(dictionary, _TORQUE_OFFSET.address)
     if offset is not None and offset.type == _TORQUE_OFFSET.type:

@@ -158,7 +158,10 @@ class DriveProfile(Part):
     @property
     def unknown(self) -> tuple[str, ...]:
         """Keys under which the profile says ``unknown``, dotted."""
-        return unknown_keys(self)
+        lag = (
+            () if self.torque_lag or "torque_lag" not in self.model_fields_set else ("torque_lag",)
+        )
+        return (*unknown_keys(self), *lag)
 
     @property
     def tunable(self) -> frozenset[str]:

@@ -45,9 +45,17 @@ def _time(value: object) -> float:
     return parse_quantity(value, "time")
 
 
-_TIME_SCHEMA = WithJsonSchema(
-    {"type": "string", "pattern": r"^\s*[0-9.eE+-]+\s*(s|ms|us)\s*$", "examples": ["5 s", "0.2 ms"]}
-)
+def _delay(value: object) -> float:
+    return 0.0 if value == UNKNOWN else _time(value)
+
+
+_TIME = {
+    "type": "string",
+    "pattern": r"^\s*[0-9.eE+-]+\s*(s|ms|us)\s*$",
+    "examples": ["5 s", "0.2 ms"],
+}
+_TIME_SCHEMA = WithJsonSchema(_TIME)
+_DELAY_SCHEMA = WithJsonSchema({"anyOf": [_TIME, {"const": UNKNOWN, "type": "string"}]})
 _ADDRESS_SCHEMA = WithJsonSchema(
     {
         "type": "string",
@@ -60,8 +68,8 @@ Number = Annotated[float, Field(strict=True), AfterValidator(_finite)]
 Positive = Annotated[Number, Field(gt=0)]
 NotNegative = Annotated[Number, Field(ge=0)]
 Seconds = Annotated[float, BeforeValidator(_time), Field(gt=0), _TIME_SCHEMA]
-Delay = Annotated[float, BeforeValidator(_time), Field(ge=0), _TIME_SCHEMA]
-"""Seconds, 0 allowed."""
+Delay = Annotated[float, BeforeValidator(_delay), Field(ge=0), _DELAY_SCHEMA]
+"""Seconds; 0, which may be written ``unknown``, where nobody knows it."""
 Address = Annotated[ObjectAddress, BeforeValidator(_address), _ADDRESS_SCHEMA]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_-]{0,31}$")]
 

@@ -1,6 +1,7 @@
 """First profiles from EDS files, JSON schemas, and EDS files that are none."""
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,7 @@ from drives.profile.eds import MAX_EDS_BYTES, read_eds
 from drives.profile.schema import json_schema
 from fieldtool.cli.main import main
 from fieldtool.errors import OutputError
+from fieldtool.workflow.design_inputs import timing_of
 from fieldtool.workflow.profiling import check_profile, new_profile
 
 FOLDER = Path(load_drive("reference").path).parent
@@ -69,8 +71,35 @@ def test_gains_that_are_called_by_their_letter_are_listed(tmp_path):
     text = made.path.read_text(encoding="utf-8")
     assert "add those that are missing" in text
     assert load_drive(made.path).torque_lag == 0
-    made.path.write_text(text.replace("#   torque_lag:", "torque_lag:"), encoding="utf-8")
+    assert "\ntorque_lag: unknown\n" in text
+    made.path.write_text(
+        text.replace("torque_lag: unknown", "torque_lag: 0.22 ms"), encoding="utf-8"
+    )
     assert load_drive(made.path).torque_lag == pytest.approx(0.22e-3)
+
+
+def test_a_lag_that_is_unknown_is_as_good_as_none_and_is_told_as_an_open_fact(tmp_path):
+    text = (FOLDER / "reference.yaml").read_text(encoding="utf-8")
+    text = text.replace("eds: ", f"eds: {FOLDER}/")
+    told = "torque_lag: 0.22 ms"
+    assert told in text
+    path, found = tmp_path / "mine.yaml", {}
+    for line in ("torque_lag: unknown", "", told):
+        path.write_text(text.replace(told, line), encoding="utf-8")
+        assert ("torque_lag" in check_profile(path).unknown) == ("unknown" in line)
+        found[line] = load_drive(path)
+    said, absent, known = found.values()
+    assert said == absent
+    assert timing_of(said) == timing_of(absent)
+    assert timing_of(said).lag > timing_of(known).lag
+    path.write_text(text.replace(told, "torque_lag: perhaps"), encoding="utf-8")
+    with pytest.raises(
+        ProfileError, match="torque_lag: needs a number with one of the units s, ms"
+    ):
+        load_drive(path)
+    forms = json_schema("drive")["properties"]["torque_lag"]["anyOf"]
+    assert {"const": "unknown", "type": "string"} in forms
+    assert any(re.search(one["pattern"], "0.22 ms") for one in forms if "pattern" in one)
 
 
 def test_the_proposed_store_line_can_be_taken_over(tmp_path):
