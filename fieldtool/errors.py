@@ -8,6 +8,7 @@
     ├── NoSuchAxisError          an axis was named that the recording does not have
     ├── NoSuchToolError          a tool set was named that the machine does not have
     ├── UnfinishedWriteError     a write-back was cut off and has to be taken back first
+    ├── NotPutBackError          drives hold what a session had set for its time
     ├── PlanRefusedError         the experiment would leave a limit, or nothing safe is possible
     └── IdentificationError      the data do not allow the answer
         ├── LoopUnstableError    a position loop became unstable while it was measured
@@ -72,6 +73,10 @@ class NoSuchToolError(FieldtoolError):
 
 class UnfinishedWriteError(FieldtoolError):
     """A write-back into these drives was cut off; nothing else may be done before it is taken back."""
+
+
+class NotPutBackError(FieldtoolError):
+    """Drives still hold what a session had set for its time; it did all else, or did not write."""
 
 
 class PlanRefusedError(FieldtoolError):

@@ -24,8 +24,8 @@ STYLES: dict[Status, str] = {
     "fail": "bold red",
     "not tried": "dim",
 }
-FAILED, STOPPED = 3, 4
-"""Exit codes: refused before motion; stopped for safety."""
+FAILED, STOPPED, LEFT = 3, 4, 7
+"""Exit codes: refused before motion; stopped for safety; drives hold what was set for the moves."""
 
 
 def check(
@@ -83,7 +83,7 @@ def check(
     if as_json:
         print_json(result.as_dict())
     if result.verdict == "fail":
-        sys.exit(STOPPED if result.stopped else FAILED)
+        sys.exit(STOPPED if result.stopped else LEFT if result.not_put_back else FAILED)
 
 
 def show(console: Console, result: CheckResult) -> None:

@@ -11,7 +11,9 @@ from drives.profile import MachineProfile
 from fieldtool import workflow
 from fieldtool.cli.criticise import show_criticism
 from fieldtool.cli.output import print_json
+from fieldtool.cli.screen import TerminalScreen
 from fieldtool.cli.stop_key import StopKey
+from fieldtool.cli.stoppable import StoppableScreen
 
 ToDistinguish = Annotated[
     Path | None,
@@ -27,7 +29,7 @@ def tell_apart(
     earlier: Path,
     folder: Path,
     options: workflow.Options,
-    screen: workflow.Screen,
+    screen: TerminalScreen,
     key: StopKey,
     console: Console,
     as_json: bool,
@@ -36,10 +38,10 @@ def tell_apart(
     if options.plan != "fast":
         raise typer.BadParameter("--to-distinguish is for the fast plan")
     done = workflow.distinguish(
-        machine, earlier, folder, options, screen=screen, stop_requested=key
+        machine, earlier, folder, options, screen=StoppableScreen(screen, key), stop_requested=key
     )
     show_criticism(console, done.criticism)
     console.print(Text(done.answer, style="bold"))
     console.print(Text(f"Both recordings, criticism and report are in {folder}."))
     if as_json:
-        print_json(done.as_dict())
+        print_json({**done.as_dict(), "not_put_back": list(screen.left)})

@@ -1,9 +1,9 @@
 """Commands and exit codes.
 
 0 done; 2 wrong use or profile; 3 refused before motion; 4 stopped for safety; 5 data not good enough
-to identify; 6 write-back failed and was restored; 7 write-back failed and could not be restored; 130
-stopped by the user, machine safe.  Whatever ended a command: 4 if a drive may still be enabled, unless
-it is about a write (6 and 7).
+to identify; 6 write-back failed and was restored; 7 write-back failed and could not be restored, or all
+was done but drives hold what was set for its time; 130 stopped by the user, machine safe.  Whatever
+ended a command: 4 if a drive may still be enabled, unless it is about a write (6 and 7).
 """
 
 import sys
@@ -65,6 +65,7 @@ from fieldtool.errors import (
     IdentificationError,
     NoSuchAxisError,
     NoSuchToolError,
+    NotPutBackError,
     OutputError,
     PlanRefusedError,
 )
@@ -79,6 +80,7 @@ app = typer.Typer(
 EXIT_CODES: tuple[tuple[type[Exception], int], ...] = (
     (UserStopError, 130),
     (WriteBackMixedError, 7),
+    (NotPutBackError, 7),
     (WriteBackError, 6),
     (SafetyStopError, 4),
     (IdentificationError, 5),

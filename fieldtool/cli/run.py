@@ -76,8 +76,9 @@ def run(
     with noting("" if result.write_back is None else result.write_back.way_back):
         show_result(console, result, listed=ask.refused)
         if as_json:
-            print_json(result.as_dict())
+            print_json({**result.as_dict(), "not_put_back": list(screen.left)})
     ask.end()
+    screen.end()
 
 
 def demo(
@@ -140,8 +141,9 @@ def measure(
         with stop_key() as key, TerminalScreen(console, may_move(yes)) as screen:
             tell_apart(
                 on_bus(machine, interface, channel, bitrate), to_distinguish, folder, options,
-                StoppableScreen(screen, key), key, console, as_json,
+                screen, key, console, as_json,
             )  # fmt: skip
+        screen.end()
         return
     if plan_only:
         profile = on_bus(machine, interface, channel, bitrate)
@@ -158,7 +160,8 @@ def measure(
     console.print(f"{seconds:.0f} s of excitation; the recording is in {folder}")
     if as_json:
         times = {"excitation_s": seconds, "machine_s": seconds}
-        print_json({"folder": str(folder), "time": times})
+        print_json({"folder": str(folder), "time": times, "not_put_back": list(screen.left)})
+    screen.end()
 
 
 def _show_plan(

@@ -17,6 +17,7 @@ from fieldtool.cli.progress import Left, bar_of, clock, long, short
 from fieldtool.cli.sheet import Sheet
 from fieldtool.design.tuning import Tuning
 from fieldtool.design.verdict import Comparison
+from fieldtool.errors import NotPutBackError
 from fieldtool.experiment.forecast import AxisForecast
 from fieldtool.experiment.multisine.runner import MultisineProgress
 from fieldtool.experiment.stepped.plan import SweepPlan
@@ -48,6 +49,9 @@ class TerminalScreen:
         self._busy_task: Any = None
         self._busy_since: float | None = None
         self._last_shown = 0.0
+        self.left: tuple[str, ...] = ()
+        """Axes whose drives are not as they were before the session."""
+        self._left_words = ""
 
     def __enter__(self) -> "TerminalScreen":
         return self
@@ -212,6 +216,21 @@ class TerminalScreen:
         words = {"verified": "The new parameters stand their trial.", "restored": ""}
         if words.get(result.verdict):
             self.console.print(indented(f"{words[result.verdict]}"))
+
+    def not_put_back(self, axes: Sequence[str], sentence: str) -> None:
+        """Keep for the command's end what stands among the warnings already."""
+        self.left, self._left_words = tuple(axes), sentence
+
+    def end(self) -> None:
+        """End a command that has done and shown all it was to.
+
+        Raises
+        ------
+        NotPutBackError
+            If drives still hold what the session had set for its time.
+        """
+        if self.left:
+            raise NotPutBackError(f"{self._left_words}. All else was done.")
 
     def _close(self) -> None:
         self._busy_since = None

@@ -24,7 +24,7 @@ class StoppableScreen:
         self.fast_plan = self._unless_stopped(screen.fast_plan)
         self.found = self._unless_stopped(screen.found)
         self.designed = self._unless_stopped(screen.designed)
-        self.verified = screen.verified
+        self.verified, self.not_put_back = screen.verified, screen.not_put_back
 
     def _unless_stopped(self, show: Callable[P, None]) -> Callable[P, None]:
         def shown(*arguments: P.args, **named: P.kwargs) -> None:

@@ -140,8 +140,9 @@ def switch(
         if result.in_memory:
             console.print(indented(_taken_back(result)))
         if as_json:
-            print_json(written_as_dict(folder, result))
+            print_json({**written_as_dict(folder, result), "not_put_back": list(screen.left)})
     ask.end()
+    screen.end()
 
 
 def _taken_back(result: WriteBack) -> str:

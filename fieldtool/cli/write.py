@@ -45,8 +45,9 @@ def write(
     with noting(result.way_back):
         show_parameters(console, result, listed=ask.refused)
         if as_json:
-            print_json(written_as_dict(folder, result))
+            print_json({**written_as_dict(folder, result), "not_put_back": list(screen.left)})
     ask.end()
+    screen.end()
 
 
 def restore(

@@ -24,7 +24,7 @@ from fieldtool.workflow.models import prior_model
 from fieldtool.workflow.planning import timing, usual_seconds
 from fieldtool.workflow.preparation import axes_of, setting_of
 from fieldtool.workflow.session import resolved
-from fieldtool.writeback.temporary import backed_up
+from fieldtool.writeback.temporary import backed_up, left_axes
 from fieldtool.writeback.unfinished import JOURNAL, refuse_unfinished
 
 SESSIONS = Path("sessions")
@@ -62,6 +62,8 @@ class MoveChecks:
         """Whether axes were enabled."""
         self.stopped = False
         """Whether a safety stop ended it, or a drive may still be enabled."""
+        self.left: list[str] = []
+        """Axes whose drives still hold what was set for the moves."""
 
     def run(self, bus: Bus, stop_requested: Callable[[], bool]) -> None:
         """Plan, move, judge; what goes wrong is a finding.
@@ -83,9 +85,9 @@ class MoveChecks:
                     with self._noted(group, folder):
                         self._plan_and_move(group)
                 finally:
-                    left = [drive.axis for drive in group.drives if drive.left_changed]
-                    changed = f"{', '.join(left)}: not everything is as it was before"
-                    for text in group.warnings or ([changed] if left else []):
+                    self.left = left_axes(group.drives)
+                    changed = f"{', '.join(self.left)}: not everything is as it was before"
+                    for text in group.warnings or ([changed] if self.left else []):
                         todo = f"Once all drives can be reached again: fieldtool restore {folder}"
                         self._findings.note("put back", "fail", text, todo=todo)
                     self._pace(group, bus)

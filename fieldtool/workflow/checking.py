@@ -41,6 +41,8 @@ class CheckResult:
     """Whether axes were enabled and moved."""
     stopped: bool = False
     """Whether a safety stop ended the moves, or a drive may still be enabled after them."""
+    not_put_back: tuple[str, ...] = ()
+    """Axes whose drives still hold what was set for the moves."""
 
     @property
     def verdict(self) -> Status:
@@ -68,6 +70,7 @@ class CheckResult:
             "machine": self.machine,
             "verdict": self.verdict,
             "moved": self.moved,
+            "not_put_back": list(self.not_put_back),
             "findings": [one.as_dict() for one in self.findings],
         }
 
@@ -153,6 +156,7 @@ class _Check:
             tuple(self._findings.all),
             moved=moves is not None and moves.moved,
             stopped=moves is not None and moves.stopped,
+            not_put_back=() if moves is None else tuple(moves.left),
         )
 
     def _on_bus(self, bus: Bus) -> None:

@@ -30,8 +30,9 @@ from fieldtool.records.yaml_file import write_yaml
 from fieldtool.workflow.planning import PlannedFast
 from fieldtool.workflow.verified import Verified
 from fieldtool.writeback.alone import connected
+from fieldtool.writeback.temporary import left_axes, left_words
 from fieldtool.writeback.transaction import WriteBack
-from fieldtool.writeback.unfinished import refuse_unfinished
+from fieldtool.writeback.unfinished import is_left_open, refuse_unfinished
 
 PlanName = Literal["classic", "fast"]
 
@@ -69,6 +70,9 @@ class Screen(Protocol):
     def verified(self, result: Verified) -> None:
         """New parameters were tried on the machine; those that did not stand it are taken back."""
 
+    def not_put_back(self, axes: Sequence[str], sentence: str) -> None:
+        """The session has done all it was to do, but drives of these axes are not as they were."""
+
 
 class Quiet:
     """A screen that shows nothing."""
@@ -103,6 +107,9 @@ class Quiet:
 
     def verified(self, result: Verified) -> None:
         """Show nothing."""
+
+    def not_put_back(self, axes: Sequence[str], sentence: str) -> None:
+        """Show nothing: it is among the warnings."""
 
 
 _NO_USE_TO_WRITE = ("plan", "excitation_time", "response", "motor_inertia")
@@ -269,18 +276,18 @@ def open_session(
             try:
                 yield session, group
             except BaseException as error:
-                for text in group.warnings:  # what an earlier motion left matters all the more now
+                # what an earlier motion left matters all the more now
+                left = left_axes(group.drives) if is_left_open(folder.path) else []
+                for text in (*group.warnings, *([left_words(left, folder.path)] if left else ())):
                     if text not in getattr(error, "__notes__", ()):
                         error.add_note(text)
                 raise
             for text in (*group.warnings, trace_problem(group.line.can_bus)):
                 if text:
                     session.warn(text)
-            if left := [drive.axis for drive in group.drives if drive.left_changed]:
-                session.warn(
-                    f"{', '.join(left)}: not everything is as it was before. Once all drives can be "
-                    f"reached again: fieldtool restore {folder.path}"
-                )
+            if left := left_axes(group.drives):
+                session.warn(left_words(left, folder.path))
+                session.screen.not_put_back(left, left_words(left, folder.path))
     except BaseException as error:
         with uninterrupted():  # nothing may hide why it ended
             folder.note("ended", error=type(error).__name__, text=str(error))

@@ -17,7 +17,7 @@ from drives.errors import (
 from drives.parameters import Change, can_store, load_journal
 from drives.parameters.journal import State
 from fieldtool.design.tuning import Tuning, why_not_stored
-from fieldtool.errors import OutputError, PlanRefusedError
+from fieldtool.errors import NotPutBackError, OutputError, PlanRefusedError
 from fieldtool.records.model import MachineModel
 from fieldtool.workflow.session import Options, Session, parameter_table
 from fieldtool.workflow.verified import Verified
@@ -27,6 +27,7 @@ from fieldtool.writeback.earlier import (
     refuse_other_drives,
     written_since,
 )
+from fieldtool.writeback.temporary import left_axes, left_words
 from fieldtool.writeback.transaction import WriteBack, apply, changes_for
 
 Confirm = Callable[[Sequence[Change]], bool]
@@ -75,6 +76,8 @@ def written(
         As :func:`fieldtool.writeback.transaction.apply`; also if the new parameters fail their trial.
     UserStopError
         If the user stopped; where the write had ended, a note says so.
+    NotPutBackError
+        If drives hold what the measurement had set for its time; nothing was written.
     """
     if not options.write:
         try:
@@ -90,6 +93,8 @@ def written(
             "only parameters that were tried on the machine are stored: leave --no-verify or --store "
             "away. Nothing was written."
         )
+    if left := left_axes(group.drives):
+        raise NotPutBackError(f"{left_words(left, session.folder.path)}. Nothing was written.")
     refuse_other_drives(session.folder.parameters_before, group.drives)
     verification, never = None, why_not_stored(tuning.bound, identified=believed)
     if options.verify:

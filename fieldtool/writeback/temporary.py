@@ -49,11 +49,21 @@ def backed_up(machine: str, drives: Sequence[CanopenDrive], backup_path: Path) -
         finally:
             for drive in drives:
                 drive.left_changed |= drive.boots != boots[drive.axis]
-            left = [drive.axis for drive in drives if drive.left_changed]
+            left = left_axes(drives)
             if not left:
                 keeper.forget(journal, before)
             elif (cause := sys.exc_info()[1]) is not None:
-                cause.add_note(
-                    f"{', '.join(left)}: not everything is as it was before. Once all drives "
-                    f"can be reached again: fieldtool restore {backup.parent}"
-                )
+                cause.add_note(left_words(left, backup.parent))
+
+
+def left_axes(drives: Sequence[CanopenDrive]) -> list[str]:
+    """Return the axes whose drives still hold what was set for a time."""
+    return [drive.axis for drive in drives if drive.left_changed]
+
+
+def left_words(axes: Sequence[str], folder: Path) -> str:
+    """Say that drives still hold what was set for a time, and what brings the old values back."""
+    return (
+        f"{', '.join(axes)}: not everything is as it was before. Once all drives can be reached "
+        f"again: fieldtool restore {folder}"
+    )

@@ -269,6 +269,11 @@ def _lock_of(journal_file: Path) -> FileLock:
     return FileLock(journal_file.with_suffix(".lock"), timeout=0)
 
 
+def is_left_open(folder: Path) -> bool:
+    """Return whether the journal of this session says that something is to be taken back."""
+    return _may_be_open(folder / JOURNAL)
+
+
 def is_at_work(folder: Path) -> bool:
     """Return whether a living process has the journal of this session open."""
     lock = _lock_of(folder / JOURNAL)
