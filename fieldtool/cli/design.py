@@ -77,8 +77,13 @@ def design(
         )
     console = console_of(as_json)
     with ShareBar(console, "design") as bar:
-        tuning = workflow.redesign(folder, response, bound, png, bar, compare=compare)
+        said: list[str] = []
+        tuning = workflow.redesign(
+            folder, response, bound, png, bar, compare=compare, say=said.append
+        )
     show_tuning(console, tuning)
+    for sentence in said:
+        console.print(indented(sentence))
     for axis in tuning.axes:
         console.print(Text(f"{axis.axis}:"))
         for name, value in axis.parameters.items():

@@ -16,6 +16,7 @@ from fieldtool.records.yaml_file import write_yaml
 from fieldtool.report.design_picture import draw_design
 from fieldtool.workflow.design_inputs import drive_sides, moves_of
 from fieldtool.workflow.models import model_of
+from fieldtool.workflow.reporting import renewing_report
 from fieldtool.writeback.earlier import written_since
 
 NOT_KNOWN = 0.3
@@ -35,6 +36,7 @@ def redesign(
     advance: Advance = lambda *_: None,
     *,
     compare: bool = False,
+    say: Callable[[str], None] = lambda _: None,
 ) -> Tuning:
     """Design parameters from a session folder's model and keep them there.
 
@@ -53,6 +55,8 @@ def redesign(
     compare
         Whether responses that are stiffer than the chosen one are computed, too; softer ones are
         anyhow.
+    say
+        Told what a person should know besides.
 
     Raises
     ------
@@ -66,9 +70,10 @@ def redesign(
     machine = load_machine(folder.machine)
     model = model_of(machine, folder.model)
     check_known(model)
-    tuning = designed(folder, machine, model, response, bound, advance, compare=compare)
-    if picture is not None:
-        draw_design(tuning, machine_kinds(model), picture)
+    with renewing_report(folder_path, say):
+        tuning = designed(folder, machine, model, response, bound, advance, compare=compare)
+        if picture is not None:
+            draw_design(tuning, machine_kinds(model), picture)
     return tuning
 
 

@@ -1,7 +1,8 @@
 """A session folder's report: whatever is there, read and put on one page."""
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -53,6 +54,34 @@ def report(folder_path: Path, out: Path | None = None) -> Path:
     out = out or folder.report
     write_page(page_of(material_of(folder)), out)
     return out
+
+
+@contextmanager
+def renewing_report(folder_path: Path, say: Callable[[str], None]) -> Iterator[None]:
+    """Renew the report that a session folder has when the work inside ends, however it ends.
+
+    A folder without a report gets none.  Why the report can not be renewed is said, and noted at an
+    error that is on its way; it is no error itself.
+    """
+    try:
+        yield
+    except BaseException as error:
+        with suppress(Exception):  # nothing may hide why it ended
+            _renew(SessionFolder(folder_path), error.add_note)
+        raise
+    _renew(SessionFolder(folder_path), say)
+
+
+def _renew(folder: SessionFolder, say: Callable[[str], None]) -> None:
+    if not (folder.report.is_file() and folder.events.is_file()):
+        return
+    try:
+        report(folder.path)
+    except UserStopError as error:
+        error.add_note(f"{folder.report} was not renewed yet; all else was done.")
+        raise
+    except Exception as error:  # a defect of the report, too: what is reported was done
+        say(f"The report was not renewed, {folder.report} shows what was so before: {error}")
 
 
 def report_of_recording(source: Path, found: Criticised, recording: Recording, out: Path) -> None:

@@ -35,7 +35,7 @@ from fieldtool.workflow.models import (
     simulated_words,
     truth_model,
 )
-from fieldtool.workflow.reporting import report
+from fieldtool.workflow.reporting import renewing_report, report
 from fieldtool.workflow.rescued import rescue
 from fieldtool.workflow.session import (
     Options,
@@ -259,9 +259,13 @@ def write(
     folder = SessionFolder.existing(folder_path)
     tuning = read_tuning(folder.needed(folder.tuning, "`fieldtool design` on this folder"))
     profile = machine or folder.machine
-    with open_session(profile, folder_path, screen, stop_requested, True, "write", options) as (
-        session,
-        group,
+    say = (screen or Quiet()).say
+    with (
+        renewing_report(folder_path, say),
+        open_session(profile, folder_path, screen, stop_requested, True, "write", options) as (
+            session,
+            group,
+        ),
     ):
         known = folder.model.is_file()
         model = model_of(session.machine, folder.model) if known else prior_model(session.machine)
@@ -318,7 +322,11 @@ def restore(
     simulated = simulated_words(profile)
     if simulated:
         screen.say(f"{simulated} {BEGIN_ANEW}")
-    with connected(profile, trace=trace, to_move=False) as group:
+    folder = SessionFolder(source.backup_path.parent)
+    with (
+        renewing_report(folder.path, screen.say),
+        connected(profile, trace=trace, to_move=False) as group,
+    ):
         screen.stage("Bring the old parameters back")
         restored = bring_back(
             profile.name,
@@ -329,13 +337,16 @@ def restore(
             without=without,
             say=screen.say,
         )
-    folder = SessionFolder(source.backup_path.parent)
-    if backup.is_dir() or folder.events.is_file():  # a file may lie anywhere
-        name = source.backup_path.name
-        memory = {one.axis: one.memory.value for one in restored.outcomes}
-        folder.note(
-            "restored", stored=restored.stored, memory=memory, without=sorted(without), backup=name
-        )
+        if backup.is_dir() or folder.events.is_file():  # a file may lie anywhere
+            name = source.backup_path.name
+            memory = {one.axis: one.memory.value for one in restored.outcomes}
+            folder.note(
+                "restored",
+                stored=restored.stored,
+                memory=memory,
+                without=sorted(without),
+                backup=name,
+            )
     return restored
 
 

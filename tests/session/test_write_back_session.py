@@ -26,6 +26,7 @@ from drives.sim.faults import (
     WriteAltered,
 )
 from drives.sim.wire import unchanged
+from fieldtool.errors import OutputError
 from tests.tunings import begun
 from tests.untried import Stood
 
@@ -642,6 +643,51 @@ def test_the_report_says_what_a_power_cycle_brings_after_a_restore(session):
     assert "Their non-volatile memory holds it too." in lead("--store")
     power_cycle(session)
     assert session.changed() == {}
+
+
+def page_of(session):
+    html = (session.out / "report.html").read_text(encoding="utf-8")
+    return re.sub(r"<[^>]*>|\s+", " ", html)
+
+
+def test_a_report_that_is_there_is_renewed_by_write_and_restore(session, monkeypatch):
+    assert write(session).code == 0
+    assert not (session.out / "report.html").exists(), "none is made where there was none"
+    assert session.command("restore", session.out).code == 0
+    assert session.command("report", session.out).code == 0
+    assert "afterwards the old ones were brought back" in page_of(session)
+    assert write(session).code == 0
+    assert "afterwards the old ones were brought back" not in page_of(session)
+    assert session.command("restore", session.out).code == 0
+    assert "afterwards the old ones were brought back" in page_of(session)
+    guards = session.machine.node(ARM).dictionary.guards
+    monkeypatch.setitem(guards, VELOCITY_I, lambda _: 0x08000022)
+    assert write(session, "--no-verify").code == 6
+    assert "The session ended: arm, velocity_i, object 0x2010:03: the drive holds" in page_of(
+        session
+    )
+
+
+def test_a_report_that_can_not_be_renewed_hides_nothing(session, monkeypatch):
+    assert session.command("report", session.out).code == 0
+    before = (session.out / "report.html").read_bytes()
+
+    def fails(*_):
+        raise OutputError("no room")
+
+    monkeypatch.setattr("fieldtool.workflow.reporting.write_page", fails)
+    outcome = write(session)
+    assert outcome.code == 0, outcome.err
+    assert "The report was not renewed" in outcome.out
+    assert "no room" in outcome.out
+    guards = session.machine.node(ARM).dictionary.guards
+    monkeypatch.setitem(guards, VELOCITY_I, lambda _: 0x08000022)
+    write_tuning(session, {"velocity_i": 3.0})
+    outcome = write(session, "--no-verify")
+    assert outcome.code == 6
+    assert "arm, velocity_i, object 0x2010:03: the drive holds" in outcome.err
+    assert "The report was not renewed" in outcome.err
+    assert (session.out / "report.html").read_bytes() == before
 
 
 def unproven(_):

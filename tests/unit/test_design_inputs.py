@@ -24,6 +24,7 @@ from fieldtool.design.drive_side import GAINS, DriveSide
 from fieldtool.design.notes import drive_notes
 from fieldtool.design.predict import AxisPrediction
 from fieldtool.design.rule import DesignError
+from fieldtool.errors import OutputError
 from fieldtool.records.model_file import read_model, write_model
 from fieldtool.records.recording import save
 from fieldtool.records.session_folder import SessionFolder
@@ -109,6 +110,31 @@ def test_without_a_backup_the_design_stands_and_says_so(tmp_path: Path) -> None:
     folder.parameters_before.write_text("nonsense: [")
     machine = load_machine(folder.machine)
     assert all("parameters-before.yaml" in s.unreadable for s in drive_sides(folder, machine))
+
+
+def test_a_report_that_is_there_is_renewed_by_a_design(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = session(tmp_path, ("reference", "reference"))
+    folder.note("session", command="measure")
+    main_code(["design", str(folder.path), "--response", "soft"])
+    assert not folder.report.exists()
+    folder.report.write_text("an older state")
+    main_code(["design", str(folder.path), "--response", "soft"])
+    page = folder.report.read_text(encoding="utf-8")
+    assert "Commissioning report" in page
+    assert "position_p" in page
+    capsys.readouterr()
+
+    def fails(*_: object) -> None:
+        raise OutputError("no room")
+
+    monkeypatch.setattr("fieldtool.workflow.reporting.write_page", fails)
+    main_code(["design", str(folder.path), "--response", "soft"])
+    said = " ".join(capsys.readouterr().out.split())
+    assert "The report was not renewed, " in said
+    assert "shows what was so before: no room" in said
+    assert folder.report.read_text(encoding="utf-8") == page
 
 
 def test_the_command_says_what_is_there_and_what_will_be(
