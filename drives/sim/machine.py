@@ -309,7 +309,7 @@ def _face(told: "FaceProfile | str | None", axis: "AxisProfile", beside: Path) -
         )
     try:
         return own_face(kind, eds)
-    except ValueError as error:
+    except (ValueError, ProfileError) as error:
         raise ValueError(f"{where}: {error}") from None
 
 

@@ -284,6 +284,10 @@ def in_eds(old, new):
             lambda folder: (folder / "own.eds").write_text("[1000]\n"),
             "own.eds: is no EDS: it has none of",
         ),
+        (
+            in_machine(face={"profile": "reference", "eds": "machine.yaml"}),
+            "simulation: axis table, `face`: {folder}/machine.yaml: is no EDS: it has none of the",
+        ),
     ],
 )  # fmt: skip
 def test_what_is_wrong_is_said_in_one_sentence_with_its_place(machine, tmp_path, change, said):
