@@ -12,7 +12,7 @@ from fieldtool.cli.output import Json, console_of, indented, print_json
 from fieldtool.cli.progress import ShareBar
 from fieldtool.cli.sheet import Sheet
 from fieldtool.criticise.criticism import Cause, Criticism
-from fieldtool.report.verdict import meaning
+from fieldtool.report.verdict import error_titles, meaning
 
 STYLES = {
     "adequate": "green",
@@ -104,11 +104,12 @@ def _causes(causes: tuple[Cause, ...]) -> Sheet:
 
 def _gain(criticism: Criticism) -> Sheet:
     held = criticism.held_out
-    titles = ("unseen data", "torque error before", "after", "noise", "position before", "after")
+    torque, row = error_titles(criticism)
+    titles = ("unseen data", f"{torque} error before", "after", "noise", "position before", "after")
     table = Sheet(*titles, whole=titles[1:])
     for name, one in criticism.judged.items():
         table.add(
-            f"{name} (torque: all data)" if one.data == "all" else name,
+            row[name],
             *("hidden" if e is None else f"{100 * e:.3g} %" for e in (one.before, one.after)),
             "not known" if one.noise is None else f"{100 * one.noise:.2g} %",
             *(f"{100 * e[name].position:.2g} %" for e in (held.error_before, held.error_after)),

@@ -1,10 +1,10 @@
 """Causes, what is gained by knowing them, what is left, and what was rejected."""
 
-from fieldtool.criticise.criticism import Criticism, Judged
+from fieldtool.criticise.criticism import Criticism
 from fieldtool.report.figures import bars_figure
 from fieldtool.report.material import Material
 from fieldtool.report.section import Block, Plot, Plots, Section, Table, Words
-from fieldtool.report.verdict import meaning
+from fieldtool.report.verdict import error_titles, meaning
 from fieldtool.report.words import axis_words, cause_words, effect_words, number_words, percent
 
 
@@ -65,21 +65,22 @@ def gain(material: Material) -> Section | None:
     kept = "whole experiments" if held.split == "experiments" else "stretches in time"
     unseen = Words((f"Kept unseen were {kept}: {', '.join(held.experiments)}.",))
     meaning = "An error is the RMS of measured minus simulated over the RMS of measured."
+    torque, row = error_titles(criticism)
     if not criticism.causes:
         plain = tuple(
             (
-                _row(name, one),
+                row[name],
                 percent(one.before),
                 percent(one.noise),
                 percent(held.error_before[name].position),
             )
             for name, one in criticism.judged.items()
         )
-        table = Table(("axis", "torque: error", "noise floor", "position: error"), plain)
+        table = Table(("axis", f"{torque}: error", "noise floor", "position: error"), plain)
         return Section("The error on data that no fit has seen", meaning, (table, unseen))
     rows = tuple(
         (
-            _row(name, one),
+            row[name],
             percent(one.before),
             percent(one.after),
             percent(one.noise),
@@ -98,7 +99,7 @@ def gain(material: Material) -> Section | None:
     table = Table(
         (
             "axis",
-            "torque: error before",
+            f"{torque}: error before",
             "after",
             "noise floor",
             "share of the explainable error that is explained",
@@ -115,10 +116,6 @@ def gain(material: Material) -> Section | None:
         meaning,
         (table, Plots((plot,), 2), unseen),
     )
-
-
-def _row(name: str, one: Judged) -> str:
-    return f"{name} (torque: all data)" if one.data == "all" else name
 
 
 def unexplained(material: Material) -> Section | None:

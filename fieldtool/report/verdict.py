@@ -124,3 +124,16 @@ def _stopped(material: Material) -> str:
         "" if ended.get("error") == "WriteBackError" else " early"
     )  # all was done, and taken back
     return f" The session ended{early}: {ended['text']}"
+
+
+def error_titles(criticism: Criticism) -> tuple[str, dict[str, str]]:
+    """Return what the torque is called in a table of errors, and what each axis' row is.
+
+    What is told of all data is marked, once where that is so of all axes.
+    """
+    whole = {name for name, one in criticism.judged.items() if one.data == "all"}
+    if whole and len(whole) == len(criticism.judged):
+        return "torque, all data", {name: name for name in whole}
+    return "torque", {
+        name: f"{name} (torque: all data)" if name in whole else name for name in criticism.judged
+    }

@@ -200,6 +200,20 @@ def test_an_axis_that_all_data_judge_has_their_figures_in_the_tables(apart):
     assert table.rows[1][:2] == ("b (torque: all data)", "12 %")
 
 
+def test_all_data_that_judge_all_axes_are_named_once_in_a_table(apart):
+    judged = {name: replace(one, data="all") for name, one in apart.judged.items()}
+    criticism = replace(apart, judged=judged)
+    assert len(judged) > 1
+    shown = screen(criticism)
+    assert shown.count("all data error before") == 1
+    assert "(torque: all data)" not in shown
+    table = gain(Material("x", criticism=criticism)).blocks[0]
+    assert [row[0] for row in table.rows] == list(judged)
+    assert [title for title in table.columns if "all data" in title] == [
+        f"torque, all data: error{' before' if criticism.causes else ''}"
+    ]
+
+
 def test_what_axes_are_judged_by_is_read_back_and_files_without_it_are_read(apart, tmp_path):
     file, plain = tmp_path / "criticism.yaml", apart.as_dict()
     write_yaml(file, plain)
