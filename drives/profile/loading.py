@@ -2,17 +2,22 @@
 
 from collections.abc import Mapping
 from importlib.resources import as_file, files
+from os.path import isfile
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 from pydantic import ValidationError
 
 from drives.errors import ProfileError
+from drives.profile.bus import BusProfile
 from drives.profile.drive import DriveProfile
 from drives.profile.machine import MachineProfile
 from drives.profile.plain_words import place_words, problem_words, unit_of
 from drives.profile.values import LocatedError
 from drives.profile.yaml_reader import Lines, Location, line_of, read_yaml
+
+SIMULATED = "fieldsim"
+"""Interface of simulated machines; its channel may be a file."""
 
 
 def load_machine(name_or_path: str | Path) -> MachineProfile:
@@ -24,7 +29,20 @@ def load_machine(name_or_path: str | Path) -> MachineProfile:
         If there is none, or it is wrong: with file, line, key and value.
     """
     path = _find("machines", name_or_path)
-    return _load(path, MachineProfile)
+    machine = _load(path, MachineProfile)
+    return machine.model_copy(update={"bus": _channel_beside(machine.bus, path)})
+
+
+def _channel_beside(bus: BusProfile, path: Path) -> BusProfile:
+    """Return a simulated bus whose channel is a file beside the profile with that file's whole path.
+
+    What is no such file stays: the name of a packaged or running machine.  Channels of adapters are
+    names anyhow.
+    """
+    if bus.interface != SIMULATED or not bus.channel:
+        return bus
+    file = path.absolute().parent / str(bus.channel)
+    return bus.model_copy(update={"channel": str(file)}) if isfile(file) else bus
 
 
 def load_drive(name_or_path: str | Path, beside: Path | None = None) -> DriveProfile:
