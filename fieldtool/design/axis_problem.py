@@ -28,8 +28,6 @@ from fieldtool.design.servo import Sampled, Servo
 STEEP = 30.0
 """Cost of a bound that is missed, in durations of the move per relative excess."""
 UNSTABLE = 1e3
-WITHIN = 0.998
-"""Of a bandwidth that is to be kept: up to it the sensitivity stays below its level."""
 SOFT = 0.01
 """Weight of a compliance that is missed beside a margin: it is a wish."""
 
@@ -75,7 +73,7 @@ class AxisProblem:
         self._reference = 1 + gains[..., axis] * self._plant
         self._far = grids.omega > bounds.top
         widths = bounds.bandwidths or (0.0,) * len(servos)
-        held = [grids.omega[0] < WITHIN * widths[i] for i in (axis, *others)]
+        held = [grids.omega[0] <= widths[i] * (1 + 1e-12) for i in (axis, *others)]
         self._held = [below if below.any() else None for below in held]
         self._motion = AxisMotion(grids, servos, axis, moves, bounds, fed)
 

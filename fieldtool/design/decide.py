@@ -206,7 +206,7 @@ def _tuning(result: _Result, response: str) -> Tuning:
     notes = list(notes_of(task.model, servos, task.moves))
     if result.instead:
         notes.append(
-            f"A {response} response that is nowhere slower can not be had within its margin on all "
+            f"A {response} response that is nowhere slower was not found within its margin on all "
             f"machines that the model allows: these are the {result.instead} one's parameters."
         )
     for k, (side, servo, axis) in enumerate(zip(task.sides, servos, prediction.axes, strict=True)):

@@ -46,6 +46,8 @@ UNKNOWN_TOP = 3.0
 RIGID_TOP = 2 * np.pi * 30.0
 """rad/s: the same for a machine without modes.  A measurement of rigid axes stays far below it; a mode
 that it did not see at w would have bent the response by (w / mode)^2 of its share."""
+WITHIN = 0.998
+"""Of a softer response's bandwidth: up to it the sensitivity stays below its level."""
 INSIDE = 0.985
 """Of the bound: what the search keeps, so that rounding does not leave it."""
 AGAIN, REPAIRED = 140, 100
@@ -141,7 +143,7 @@ class Task:
     def bounds(self, axis: int) -> Bounds:
         """Return what one axis has to keep."""
         side, does = self.sides[axis], self.does[axis]
-        widths = self.softer.bandwidths if self.softer else (0.0,) * len(self.sides)
+        widths = self.softer.bandwidths if self.softer else ()
         return Bounds(
             INSIDE * self.bound,
             max(NOISE_SHARE * side.torque_limit, does.noise),
@@ -151,7 +153,7 @@ class Task:
             does.compliance,
             self.softest.get(axis, inf),
             max(FAR_GAIN, does.far),
-            tuple(2 * np.pi * width for width in widths),
+            tuple(WITHIN * 2 * np.pi * width for width in widths),
         )
 
 
@@ -241,7 +243,8 @@ def _grids(task: Task) -> Grids:
     duration = longest + min(max(4.0 / slow, longest, 4 * slowest), 6 * longest + 10 * slowest)
     low = 0.05 * min(float(np.abs(values).min()) + slow, 2 * np.pi / duration)
     high = max(10 * task.top, 5 * float(modes.max()) if modes.size else 0.0)
-    return grids_of(task.machines, low, high, HalfWave(duration, SAMPLES))
+    kept = [WITHIN * 2 * np.pi * width for width in task.softer.bandwidths] if task.softer else []
+    return grids_of(task.machines, low, high, HalfWave(duration, SAMPLES), kept)
 
 
 def _problem(task: Task, grids: Grids, servos: tuple[Servo, ...], axis: int) -> AxisProblem:

@@ -60,14 +60,20 @@ class Grids:
     """(W, M, M)."""
 
 
-def grids_of(machines: Sequence[Machine], low: float, high: float, wave: HalfWave) -> Grids:
-    """Return frequencies from ``low`` to ``high``, rad/s, with more at every mode, and responses."""
+def grids_of(
+    machines: Sequence[Machine],
+    low: float,
+    high: float,
+    wave: HalfWave,
+    also: Sequence[float] = (),
+) -> Grids:
+    """Return frequencies from ``low`` to ``high``, with more at every mode and ``also`` these, rad/s."""
     omegas = []
     for machine in machines:
         modes = np.concatenate([machine.modes, machine.held_modes])
         width = 0.03
         beside = (modes[:, None] * (1 + width * BESIDE)).ravel()
-        omegas.append(np.sort(np.concatenate([np.geomspace(low, high, GRID), beside])))
+        omegas.append(np.sort(np.concatenate([np.geomspace(low, high, GRID), beside, also])))
     responses = [
         respond(machine, omega).motors for machine, omega in zip(machines, omegas, strict=True)
     ]
