@@ -183,7 +183,8 @@ def _behaviour(dictionary: ObjectDictionary) -> Iterator[str]:
     else:
         yield "torque_offset: false"
     if variable_at(dictionary, objects.ABORT_CONNECTION.address) is None:
-        yield "# No 0x6007: find out what stops the drive when the host dies."
+        yield "# No 0x6007, so nothing that this tool knows stops the drive when the host dies: it is"
+        yield "# never moved, whatever stands here."
         yield "heartbeat_reaction: unknown"
     else:
         default = default_at(dictionary, objects.ABORT_CONNECTION.address)

@@ -8,6 +8,8 @@ from canopen.objectdictionary import ObjectDictionary
 from drives.cia402 import Mode, in_words, modes_in
 from drives.errors import ProfileError
 from drives.objects import (
+    ABORT_CONNECTION,
+    CONSUMER_HEARTBEAT,
     DEVICE_TYPE,
     PRODUCT_CODE,
     SUPPORTED_MODES,
@@ -16,7 +18,7 @@ from drives.objects import (
     VENDOR_ID,
 )
 from drives.profile.drive import DriveProfile, Identity
-from drives.profile.eds import default_at, info_at, read_eds
+from drives.profile.eds import default_at, info_at, read_eds, variable_at
 from drives.profile.loading import load_drive, packaged
 from drives.profile.values import UNKNOWN
 
@@ -166,7 +168,14 @@ def obstacles(profile: DriveProfile, supported_modes: int | None = None) -> tupl
             found.append("it has no cyclic torque mode, so the axis can not float")
     if isinstance(profile.torque, str) or isinstance(profile.torque.scale, str):
         found.append("what its torque units are worth is not known, so it can not be measured")
-    if profile.heartbeat_reaction == UNKNOWN:
+    lacking = _fail_safe_lacking(dictionary)
+    if lacking:
+        found.append(
+            f"its EDS has no {' and no '.join(lacking)}: nothing that this tool knows stops such a "
+            "drive when the host dies, so it never moves one, whatever else is found out; it can be "
+            "scanned, and checked without motion"
+        )
+    elif profile.heartbeat_reaction == UNKNOWN:
         found.append("what it does when the host dies is not known, so it may not be moved")
     found += _gains(profile)
     if profile.store is None:
@@ -178,6 +187,16 @@ def obstacles(profile: DriveProfile, supported_modes: int | None = None) -> tupl
             if info_at(dictionary, info.address) is None:
                 found.append(f"it has no {info.name} {info.address}")
     return tuple(found)
+
+
+def _fail_safe_lacking(dictionary: ObjectDictionary | None) -> list[str]:
+    if dictionary is None:
+        return []
+    return [
+        f"{info.name} {info.address.short}"
+        for info in (CONSUMER_HEARTBEAT, ABORT_CONNECTION)
+        if variable_at(dictionary, info.address) is None
+    ]
 
 
 def _gains(profile: DriveProfile) -> list[str]:

@@ -57,6 +57,68 @@ def test_what_the_file_tells_is_taken_over(tmp_path):
     assert any("no cyclic position mode" in phrase for phrase in made.obstacles)
 
 
+NEVER_MOVED = "so it never moves one, whatever else is found out"
+FAIL_SAFE = {
+    "1016": """[1016]
+ParameterName=Consumer heartbeat time
+ObjectType=0x8
+SubNumber=2
+[1016sub0]
+ParameterName=Number of entries
+ObjectType=0x7
+DataType=0x0005
+AccessType=ro
+[1016sub1]
+ParameterName=Consumer heartbeat time
+ObjectType=0x7
+DataType=0x0007
+AccessType=rw
+""",
+    "6007": """[6007]
+ParameterName=Abort connection option code
+ObjectType=0x7
+DataType=0x0003
+AccessType=rw
+""",
+}
+
+
+def obstacles_with_reaction(eds: Path, tmp_path: Path) -> list[str]:
+    """Of a first profile for which the drive's reaction to a lost host was found out."""
+    made = new_profile(eds, tmp_path / "mine.yaml")
+    text = made.path.read_text(encoding="utf-8")
+    assert "\nheartbeat_reaction: unknown" in text
+    made.path.write_text(
+        text.replace("\nheartbeat_reaction: unknown", "\nheartbeat_reaction: 3"), encoding="utf-8"
+    )
+    return list(check_profile(made.path).obstacles)
+
+
+@pytest.mark.parametrize("has", [(), ("1016",), ("6007",), ("1016", "6007")])
+def test_a_drive_that_nothing_stops_is_told_as_one_that_is_never_moved(has, tmp_path):
+    eds = tmp_path / "small.eds"
+    listed = "".join(f"{k}=0x{index}\n" for k, index in enumerate(has, 1))
+    optional = f"[OptionalObjects]\nSupportedObjects={len(has)}\n{listed}"
+    eds.write_text(SMALLEST + optional + "".join(FAIL_SAFE[index] for index in has))
+    said = [phrase for phrase in obstacles_with_reaction(eds, tmp_path) if NEVER_MOVED in phrase]
+    assert len(said) == (len(has) < 2)
+    for phrase in said:
+        assert ("consumer heartbeat time 0x1016:01" in phrase) == ("1016" not in has)
+        assert ("abort connection option code 0x6007" in phrase) == ("6007" not in has)
+        assert "it can be scanned, and checked without motion" in phrase
+
+
+def test_a_real_drive_that_nothing_stops_is_never_moved(tmp_path):
+    eds = Path(__file__).parents[3] / "shared" / "eds" / "canopen_example_e35.eds"
+    if not eds.is_file():
+        pytest.skip(f"{eds.name} is not there: it may not be shipped")
+    assert any(
+        "no consumer heartbeat time 0x1016:01 and no abort connection option code 0x6007" in phrase
+        and NEVER_MOVED in phrase
+        for phrase in obstacles_with_reaction(eds, tmp_path)
+    )
+
+
 def test_gains_are_listed_with_their_types(tmp_path):
     made = new_profile(FOLDER / "epos4.eds", tmp_path / "mine.yaml")
     found = load_drive(made.path).parameters["position_controller_p_gain"]
