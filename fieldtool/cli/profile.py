@@ -36,13 +36,19 @@ def new(
 
 @profile_app.command("check")
 def check_file(
-    file: Annotated[Path, typer.Argument(help="Drive or machine profile.")], as_json: Json = False
+    file: Annotated[
+        Path, typer.Argument(help="Drive or machine profile: a file, or a packaged one's name.")
+    ],
+    as_json: Json = False,
 ) -> None:
-    """Check a profile, and the EDS files that it names, without a drive."""
+    """Check a profile, and the drive profiles and EDS files that it names, without a drive."""
     found = check_profile(file)
     console = console_of(as_json)
     console.print(Text(f"{found.path}: a {found.kind} profile, {found.name}; it can be read."))
     _show(console, found)
+    for drive, axes in found.drives:
+        console.print(Text(f"{', '.join(axes)}: {drive.path}, a drive profile, {drive.name}."))
+        _show(console, drive)
     if as_json:
         print_json(found.as_dict())
 

@@ -5,7 +5,14 @@ from pathlib import Path
 from typing import Any
 
 from drives.errors import ProfileError
-from drives.profile import DriveProfile, load_drive, load_machine, read_yaml
+from drives.profile import (
+    DriveProfile,
+    MachineProfile,
+    load_drive,
+    load_machine,
+    packaged,
+    read_yaml,
+)
 from drives.profile.draft import draft, profile_name
 from drives.profile.eds import read_eds
 from drives.profile.match import obstacles
@@ -25,16 +32,21 @@ class CheckedProfile:
     """Keys of a drive profile that say ``unknown``, dotted."""
     obstacles: tuple[str, ...] = ()
     """What can not be done with such a drive, a phrase each."""
+    drives: tuple[tuple["CheckedProfile", tuple[str, ...]], ...] = ()
+    """Of a machine profile: its drive profiles, each once, with the axes that have it."""
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values."""
-        return {
+        plain: dict[str, Any] = {
             "file": str(self.path),
             "kind": self.kind,
             "name": self.name,
             "unknown": list(self.unknown),
             "obstacles": list(self.obstacles),
         }
+        if self.kind == "machine":
+            plain["drives"] = [{**one.as_dict(), "axes": list(axes)} for one, axes in self.drives]
+        return plain
 
 
 def new_profile(eds: Path, out: Path | None = None) -> CheckedProfile:
@@ -69,33 +81,51 @@ def new_profile(eds: Path, out: Path | None = None) -> CheckedProfile:
 
 
 def check_profile(path: Path) -> CheckedProfile:
-    """Read a drive or machine profile, and a drive profile's EDS file with it.
+    """Read a drive or machine profile, and the EDS files of its drives with it.
+
+    Parameters
+    ----------
+    path
+        A file, or the name of a packaged profile.
 
     Raises
     ------
     ProfileError
         For the first thing that is wrong: with file, line, key and value.
     """
+    if str(path) in packaged("drives"):
+        path = load_drive(path).path
+    elif str(path) in packaged("machines"):
+        path = load_machine(path).path
     data, _ = read_yaml(path)
     kind = str(data.get("format", ""))
     if kind.startswith("fieldtool-machine/"):
         machine = load_machine(path)
-        for axis in machine.axes:
-            profile = load_drive(axis.drive, machine.path)
-            if axis.eds is not None:
-                profile = profile.with_eds(machine.path.parent / axis.eds)
-            _with_eds(profile)
-        return CheckedProfile(path, "machine", machine.name)
+        return CheckedProfile(path, "machine", machine.name, drives=_drives_of(machine))
     if kind.startswith("fieldtool-drive/"):
-        profile = load_drive(path)
-        _with_eds(profile)
-        return CheckedProfile(path, "drive", profile.name, profile.unknown, obstacles(profile))
+        return _checked(load_drive(path))
     raise ProfileError(
         path, f"format must be fieldtool-drive/1 or fieldtool-machine/1, got {kind!r}", 1
     )
 
 
-def _with_eds(profile: DriveProfile) -> None:
+def _drives_of(machine: MachineProfile) -> tuple[tuple[CheckedProfile, tuple[str, ...]], ...]:
+    """Check the drive profiles of a machine; one with two EDS files counts as two."""
+    axes: dict[tuple[Path, Path | None], list[str]] = {}
+    found: dict[tuple[Path, Path | None], CheckedProfile] = {}
+    for axis in machine.axes:
+        profile = load_drive(axis.drive, machine.path)
+        if axis.eds is not None:
+            profile = profile.with_eds(machine.path.parent / axis.eds)
+        key = (profile.path, profile.eds_path)
+        if key not in found:
+            found[key] = _checked(profile)
+        axes.setdefault(key, []).append(axis.name)
+    return tuple((found[key], tuple(names)) for key, names in axes.items())
+
+
+def _checked(profile: DriveProfile) -> CheckedProfile:
     """Compare a profile with its EDS file, where it has one."""
     if profile.eds_path is not None:
         profile.with_types_of(read_eds(profile.eds_path))
+    return CheckedProfile(profile.path, "drive", profile.name, profile.unknown, obstacles(profile))

@@ -227,6 +227,45 @@ def test_checking_tells_kind_and_open_facts(tmp_path):
         check_profile(wrong)
 
 
+def machine_of(tmp_path: Path, *drives: str) -> Path:
+    """Return paper-3x3 with these drive profiles, axis by axis."""
+    text = Path(load_machine("paper-3x3").path).read_text(encoding="utf-8")
+    for drive in drives:
+        text = text.replace("drive: reference\n", f"drive: {drive}\n", 1)
+    path = tmp_path / "machine.yaml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_a_machine_is_checked_with_its_drive_profiles_each_once_with_its_axes(tmp_path):
+    found = check_profile(machine_of(tmp_path, "prbt", "nanotec", "prbt"))
+    assert [axes for _, axes in found.drives] == [("axis1", "axis3"), ("axis2",)]
+    for drive, name in zip((d for d, _ in found.drives), ("prbt", "nanotec"), strict=True):
+        assert drive == check_profile(FOLDER / f"{name}.yaml")
+        assert drive.unknown
+        assert drive.obstacles
+
+
+def test_an_axis_is_checked_with_its_own_eds(tmp_path):
+    (tmp_path / "small.eds").write_text(SMALLEST)
+    path = machine_of(tmp_path, "cia402\n    eds: small.eds", "cia402", "cia402")
+    (small, first), (none, others) = check_profile(path).drives
+    assert (first, others) == (("axis1",), ("axis2", "axis3"))
+    assert any(NEVER_MOVED in phrase for phrase in small.obstacles)
+    assert not any(NEVER_MOVED in phrase for phrase in none.obstacles)
+
+
+@pytest.mark.parametrize(
+    ("kind", "name"),
+    [("drive", n) for n in packaged("drives")] + [("machine", n) for n in packaged("machines")],
+)
+def test_a_packaged_profile_is_checked_by_its_name(kind, name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    found = check_profile(Path(name))
+    assert (found.kind, found.name) == (kind, name)
+    assert found == check_profile(found.path)
+
+
 def test_a_type_that_the_eds_does_not_have_is_named(tmp_path):
     text = (FOLDER / "reference.yaml").read_text(encoding="utf-8")
     path = tmp_path / "mine.yaml"
@@ -389,6 +428,21 @@ def test_the_command_tells_file_and_line(tmp_path, capsys):
     code, _, err = command(capsys, "profile", "new", "--eds", str(path))
     assert code == 2
     assert "is no EDS" in err
+
+
+def test_the_command_says_of_a_machine_what_it_says_of_its_drive_profiles(tmp_path, capsys):
+    path = machine_of(tmp_path, "prbt", "prbt", "reference")
+    code, out, _ = command(capsys, "profile", "check", str(path))
+    assert code == 0
+    said = " ".join(out.split())
+    for axes, name in (("axis1, axis2", "prbt"), ("axis3", "reference")):
+        _, out, _ = command(capsys, "profile", "check", name)
+        alone = " ".join(out.split()).split("it can be read. ")[1]
+        assert f"{axes}: {FOLDER / name}.yaml, a drive profile, {name}. {alone}" in said
+    code, out, _ = command(capsys, "profile", "check", str(path), "--json")
+    assert code == 0
+    assert [d["axes"] for d in json.loads(out)["drives"]] == [["axis1", "axis2"], ["axis3"]]
+    assert "it has no cyclic position mode" in out
 
 
 def test_the_command_prints_schemas(capsys):
