@@ -164,13 +164,18 @@ class DriveProfile(Part):
         return (*unknown_keys(self), *lag)
 
     @property
+    def by_hand(self) -> bool:
+        """Whether this tool writes none of the drive's gains: a person enters them."""
+        return self.gains_via not in ("objects", "password")
+
+    @property
     def tunable(self) -> frozenset[str]:
         """Names of the parameters that a design for such a drive may have.
 
         Of a drive whose gains this tool does not write they are those that a person can enter with
         the maker's software.
         """
-        if self.gains_via not in ("objects", "password"):
+        if self.by_hand:
             return frozenset(CASCADE_PARAMETERS)
         known = {n for n, one in self.parameters.items() if one.factor != UNKNOWN}
         if self.structure == "pid" and known.issuperset(PID_PARAMETERS):

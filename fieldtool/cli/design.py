@@ -89,7 +89,7 @@ def design(
         for name, value in axis.parameters.items():
             unit = unit_on(axis.kind, UNITS.get(name, ""))
             console.print(indented(f"{name:22}{value:.6g} {unit}".rstrip()))
-    console.print(Text(f"Kept in {folder}; `fieldtool write {folder}` brings it into the drives."))
+    console.print(Text(f"Kept in {folder}; {tuning.write_words(folder)}"))
     if as_json:
         print_json(tuning_as_dict(tuning))
 

@@ -334,8 +334,7 @@ def show_result(console: Console, result: SessionResult, *, listed: bool = False
             console.print(Text("\nController parameters", style="bold"))
         show_parameters(console, result.write_back, listed=listed)
         if not result.write_back.in_memory:
-            command = f"`fieldtool write {result.folder}`"
-            console.print(indented(f"{command} brings the new ones into the drives."))
+            console.print(indented(result.tuning.write_words(result.folder)))
     console.print(
         Text(
             f"\nMachine time {clock(result.moving_time)}, {clock(result.machine_time)} of it "

@@ -240,6 +240,7 @@ def _tuning(result: _Result, response: str) -> Tuning:
         _trade(task, servos),
         tuple(_shaping(task, servos, prediction)),
         tuple(dict.fromkeys(notes)),
+        by_hand=tuple(side.axis for side in task.sides if side.missing),
     )
 
 

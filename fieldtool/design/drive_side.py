@@ -125,6 +125,8 @@ class DriveSide:
     unused: Mapping[str, float | None] = field(default_factory=dict)
     """Feed-forward that no design chooses and no prediction has: what the drive holds, in its own units;
     None: not known.  It stays as it is."""
+    by_hand: bool = False
+    """Whether no gain of the drive can be written, whatever parameters it has."""
 
     def words(self, name: str, value: float) -> str:
         """Return a parameter's value with its unit."""
@@ -148,7 +150,7 @@ class DriveSide:
     @property
     def missing(self) -> tuple[str, ...]:
         """Gains that a design has and the drive can not be told: for a person to enter."""
-        return tuple(name for name in GAINS if not self.has(name))
+        return tuple(name for name in GAINS if self.by_hand or not self.has(name))
 
     def hold_of(self, name: str) -> Hold | None:
         """Return how the drive holds a parameter beside the present ones; None: any number.

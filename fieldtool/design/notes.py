@@ -46,7 +46,8 @@ def drive_notes(
     if side.missing:
         notes.append(
             f"{axis}: its drive profile has no {', '.join(side.missing)} that can be written; enter the "
-            "numbers with the maker's software, or complete `parameters` in a drive profile of your own."
+            "numbers with the maker's software, or, where objects hold them, complete `parameters` in a "
+            "drive profile of your own."
         )
     notes += _unused(side)
     if side.unreadable:

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from math import sqrt
+from pathlib import Path
 
 import numpy as np
 
@@ -111,6 +112,18 @@ class Tuning:
     """What a technician has to know, a sentence each."""
     responses: tuple[Choice, ...] = ()
     """From soft to stiff, the chosen one among them; empty where nobody chose."""
+    by_hand: tuple[str, ...] = ()
+    """Axes whose gains can not all be written: a person enters them, and a write is refused."""
+
+    def write_words(self, folder: Path) -> str:
+        """Say what brings the parameters in a session folder into the drives."""
+        command = f"`fieldtool write {folder}`"
+        if not self.by_hand:
+            return f"{command} brings them into the drives."
+        return (
+            f"{command} is refused, for gains of {', '.join(self.by_hand)} can not be written: enter "
+            "the new parameters of all axes with the makers' software."
+        )
 
 
 def as_parameters(servo: Servo, side: DriveSide | None = None) -> dict[str, float]:

@@ -94,6 +94,7 @@ class _TuningFile(StrictModel):
     shaping: list[_Shaping] = Field(default_factory=list)
     notes: list[str] = Field(default_factory=list)
     responses: list[_Choice] = Field(default_factory=list)
+    by_hand: list[str] = Field(default_factory=list)
 
 
 def tuning_as_dict(tuning: Tuning) -> dict[str, Any]:
@@ -136,6 +137,7 @@ def tuning_as_dict(tuning: Tuning) -> dict[str, Any]:
             }
             for one in tuning.responses
         ],
+        "by_hand": list(tuning.by_hand),
     }
 
 
@@ -177,6 +179,7 @@ def read_tuning(path: Path) -> Tuning:
                 )
                 for one in checked.responses
             ),
+            tuple(checked.by_hand),
         )
     except (KeyError, TypeError, ValueError) as error:
         raise FileFormatError(

@@ -147,6 +147,7 @@ def _side(axis: AxisProfile, machine: MachineProfile, kept: _Kept, cycle: float)
         axis.kind,
         profile.structure == "pid",
         _unused(profile, kept),
+        profile.by_hand,
     )
 
 

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from importlib.resources import files
 from math import inf
@@ -13,7 +14,7 @@ import pytest
 import yaml
 
 from drives.canopen_drive import connect
-from drives.errors import ProfileError
+from drives.errors import NotSupportedError, ProfileError
 from drives.parameters import back_up, planned_changes, read_loop, save_backup
 from drives.parameters.backup import checksum
 from drives.profile import load_machine
@@ -24,6 +25,7 @@ from fieldtool.design.drive_side import GAINS, DriveSide
 from fieldtool.design.notes import drive_notes
 from fieldtool.design.predict import AxisPrediction
 from fieldtool.design.rule import DesignError
+from fieldtool.design.tuning_file import read_tuning
 from fieldtool.errors import OutputError
 from fieldtool.records.model_file import read_model, write_model
 from fieldtool.records.recording import save
@@ -34,6 +36,7 @@ from fieldtool.workflow.designing import redesign
 from fieldtool.workflow.models import truth_model
 from fieldtool.workflow.preparation import recording_header
 from fieldtool.workflow.session import resolved
+from fieldtool.writeback.transaction import changes_for
 from tests.faces import machine_of, simulated
 
 
@@ -479,6 +482,29 @@ def test_what_stands_against_a_design_is_said_with_what_can_still_be_done(
     for words in said:
         assert words in text
     assert folder.tuning.is_file() == (code == 0)
+
+
+@pytest.mark.parametrize("kind", ["elmo-gold", "cia402*", "reference"])
+def test_what_a_write_refuses_is_entered_by_hand(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], kind: str
+) -> None:
+    """It was said that `fieldtool write` brings it into the drives."""
+    folder = session(tmp_path, (kind, "reference"))
+    assert main_code(["design", str(folder.path), "--response", "soft"]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    tuning = read_tuning(folder.tuning)
+    machine = machine_of((kind, "reference"), tmp_path)
+    refused = kind != "reference"
+    outcome = pytest.raises(NotSupportedError) if refused else nullcontext()
+    with simulated(machine), connect(machine) as group, outcome:
+        changes_for(group.drives, tuning)
+    assert tuning.by_hand == (("table",) if refused else ())
+    note = "table: its drive profile has no position_p, velocity_p, velocity_i that can be written"
+    assert (note in said) is refused
+    write = f"`fieldtool write {folder.path}`"
+    end = f"{write} is refused, for gains of table can not be written: enter the new parameters of"
+    assert (f"Kept in {folder.path}; {end}" in said) is refused
+    assert (f"Kept in {folder.path}; {write} brings them into the drives." in said) is not refused
 
 
 def crossed(model: dict[str, Any]) -> None:
