@@ -39,13 +39,15 @@ def write(
         stoppable = StoppableScreen(screen, key)
         ask = WriteQuestion(console, key, yes=yes, store=store)
         profile = on_bus(SessionFolder.existing(folder).profile, interface, channel, bitrate)
-        result = workflow.write(
+        result, verified = workflow.write(
             folder, options, ask, screen=stoppable, machine=profile, stop_requested=key
         )
     with noting(result.way_back):
         show_parameters(console, result, listed=ask.refused)
         if as_json:
-            print_json({**written_as_dict(folder, result), "not_put_back": list(screen.left)})
+            trial = verified.as_dict() if verified else None
+            done = written_as_dict(folder, result) | {"verification": trial}
+            print_json({**done, "not_put_back": list(screen.left)})
     ask.end()
     screen.end()
 

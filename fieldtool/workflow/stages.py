@@ -46,6 +46,7 @@ from fieldtool.workflow.session import (
     never,
     open_session,
 )
+from fieldtool.workflow.verified import Verified
 from fieldtool.workflow.writing import written
 from fieldtool.writeback.alone import connected
 from fieldtool.writeback.restoring import Restored, bring_back, source_of
@@ -245,11 +246,12 @@ def write(
     screen: Screen | None = None,
     machine: MachineProfile | None = None,
     stop_requested: Callable[[], bool] = never,
-) -> WriteBack:
+) -> tuple[WriteBack, Verified | None]:
     """Write a session folder's tuning into the machine's drives, and try it on the machine.
 
     ``machine`` is the session's own profile, on another bus if need be; the folder's where None.
-    Old and new parameters move the machine a little (``Options.verify``).
+    Old and new parameters move the machine a little (``Options.verify``).  The second result is what
+    that trial showed; None where nothing was written or tried.
 
     Raises
     ------
@@ -269,10 +271,9 @@ def write(
     ):
         known = folder.model.is_file()
         model = model_of(session.machine, folder.model) if known else prior_model(session.machine)
-        result, _ = written(
+        return written(
             session, group, tuning, options, confirm, model, believed=known, ask_to_move=True
         )
-        return result
 
 
 def restore(

@@ -486,6 +486,15 @@ def test_a_whole_run_has_the_verification_in_its_json(small_bench):
     assert found["axes"][0]["after"]["sensitivity_peak"] < 2.1
 
 
+@pytest.mark.parametrize("options", [(), ("--no-verify",)])
+def test_a_write_has_the_verification_in_its_json(session, options):
+    outcome = write(session, "--json", *options)
+    assert outcome.code == 0, outcome.err
+    told = json.loads(outcome.out)
+    assert told["written"] is True
+    assert told["verification"] == (None if options else verification(session))
+
+
 @pytest.mark.parametrize("moment", ["judging", "after the last trial", "storing the second drive"])
 def test_ctrl_c_after_the_last_motion_stores_nothing(session, monkeypatch, moment):
     """No cycle asks for a stop any more: the work in hand has to."""
