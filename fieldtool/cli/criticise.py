@@ -8,6 +8,7 @@ from rich.console import Console
 from rich.text import Text
 
 from fieldtool import workflow
+from fieldtool.cli.options import check_picture
 from fieldtool.cli.output import Json, console_of, indented, print_json
 from fieldtool.cli.progress import ShareBar
 from fieldtool.cli.sheet import Sheet
@@ -42,6 +43,7 @@ def criticise(
     as_json: Json = False,
 ) -> None:
     """Say what the simulation of a recording gets wrong, name causes, measure the gain."""
+    check_picture("--picture", picture)
     console = console_of(as_json)
     with ShareBar(console, "simulate") as bar:
         found = workflow.criticise(source, model, picture, bar, report)

@@ -8,6 +8,8 @@ import typer
 
 from fieldtool import workflow
 from fieldtool.design.tuning import RESPONSES
+from fieldtool.errors import OutputError
+from fieldtool.records.files import check_writable
 
 Machine = Annotated[str, typer.Argument(help="Name of a machine profile, or path of its file.")]
 Out = Annotated[
@@ -111,6 +113,16 @@ def check_response(response: str) -> None:
     """Refuse a response that there is none of."""
     if response not in RESPONSES:
         raise typer.BadParameter(f"--response is one of {', '.join(RESPONSES)}, got {response!r}")
+
+
+def check_picture(option: str, picture: Path | None) -> None:
+    """Refuse a picture that could not be written, before anything is computed for it."""
+    if picture is None:
+        return
+    try:
+        check_writable(picture)
+    except OutputError as error:
+        raise typer.BadParameter(f"{option}: {error}") from None
 
 
 def tried(verify: bool, store: bool) -> bool:

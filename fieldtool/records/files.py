@@ -21,8 +21,7 @@ def write_atomic(path: Path | str, content: bytes | memoryview) -> None:
         If the folder is missing or not writable, or the disk is full; the sentence says which.
     """
     path = Path(path)
-    if os.path.isdir(path):  # false where that can not be seen, too
-        raise OutputError(f"{path} is a folder, not a file: give a file name to write to.")
+    _refuse_folder(path)
     temporary: str | None = None
     try:
         handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
@@ -38,6 +37,22 @@ def write_atomic(path: Path | str, content: bytes | memoryview) -> None:
     finally:
         if temporary is not None:
             Path(temporary).unlink(missing_ok=True)
+
+
+def check_writable(path: Path) -> None:
+    """Refuse a path to which :func:`write_atomic` could write nothing; what is there is unchanged.
+
+    Raises
+    ------
+    OutputError
+        As :func:`write_atomic`.
+    """
+    _refuse_folder(path)
+    try:
+        with tempfile.NamedTemporaryFile(prefix=f".{path.name}.", dir=path.parent):
+            pass
+    except OSError as error:
+        raise OutputError(_reason(path, 0, error)) from error
 
 
 def write_new(path: Path, text: str) -> None:
@@ -123,6 +138,11 @@ def check_size(path: Path | str, max_bytes: int) -> int:
             f"is {status.st_size / MEBIBYTE:.1f} MiB, the limit is {max_bytes / MEBIBYTE:.0f} MiB.",
         )
     return status.st_size
+
+
+def _refuse_folder(path: Path) -> None:
+    if os.path.isdir(path):  # false where that can not be seen, too
+        raise OutputError(f"{path} is a folder, not a file: give a file name to write to.")
 
 
 def _mode_of(path: Path) -> int:

@@ -484,6 +484,39 @@ def test_what_stands_against_a_design_is_said_with_what_can_still_be_done(
     assert folder.tuning.is_file() == (code == 0)
 
 
+@pytest.mark.parametrize(
+    ("command", "option"),
+    [("design", "--png"), ("identify", "--picture"), ("criticise", "--picture")],
+)
+@pytest.mark.parametrize(
+    ("picture", "words"),
+    [
+        (".", "is a folder"),
+        ("none/one.png", "there is no folder"),
+        ("model.yaml/one.png", "there is no folder"),
+        (f"{'n' * 250}.png", "can not be written"),
+    ],
+)
+def test_a_picture_that_can_not_be_written_is_refused_before_anything(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    command: str,
+    option: str,
+    picture: str,
+    words: str,
+) -> None:
+    """A design anew had taken the place of the one before by then."""
+    folder = session(tmp_path, ("reference", "reference"), backup=False)
+    folder.tuning.write_text("as it was")
+    before = sorted(folder.path.iterdir())
+    assert main_code([command, str(folder.path), option, str(folder.path / picture)]) == 2
+    said = capsys.readouterr().err
+    assert option in said
+    assert words in " ".join(said.replace("│", " ").split())
+    assert folder.tuning.read_text() == "as it was"
+    assert sorted(folder.path.iterdir()) == before
+
+
 @pytest.mark.parametrize("kind", ["elmo-gold", "cia402*", "reference"])
 def test_what_a_write_refuses_is_entered_by_hand(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], kind: str
