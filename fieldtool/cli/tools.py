@@ -85,8 +85,7 @@ def compare(machine: Machine, one: Name, other: Name, as_json: Json = False) -> 
                         "axis": d.axis,
                         "name": d.name,
                         "object": str(d.address),
-                        one: d.one,
-                        other: d.other,
+                        "values": {one: d.one, other: d.other},
                     }
                     for d in differences
                 ],

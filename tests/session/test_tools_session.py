@@ -50,7 +50,10 @@ def test_sets_are_kept_compared_and_switched_there_and_back(session, tmp_path):
         ("table", "velocity_p"),
         ("arm", "velocity_p"),
     }
-    assert next(d for d in differences if d["name"] == "velocity_p")["bare"] == old[TABLE]
+    assert next(d for d in differences if d["name"] == "velocity_p")["values"] == {
+        "bare": old[TABLE],
+        "gripper": new[TABLE],
+    }
     back = tools(session, "switch", "bare", "--yes", "--out", tmp_path / "one")
     assert back.code == 0, back.err
     assert session.changed() == {}, "bit by bit what it was"
@@ -66,6 +69,24 @@ def test_sets_are_kept_compared_and_switched_there_and_back(session, tmp_path):
         ("bare", False),
         ("gripper", False),
     ]
+
+
+@pytest.mark.usefixtures("untried")
+def test_a_set_may_have_the_name_of_a_key(session):
+    """Its value took the place of the axis in what a program reads."""
+    assert tools(session, "keep", "axis").code == 0
+    old = gain(session, TABLE)
+    assert session.command("write", session.out, "--yes").code == 0
+    assert tools(session, "keep", "object", "--from", session.out).code == 0
+    compared = json.loads(tools(session, "compare", "axis", "object", "--json").out)
+    rows = [d for d in compared["differences"] if d["axis"] == "table"]
+    (row,) = [d for d in rows if d["name"] == "velocity_p"]
+    assert row == {
+        "axis": "table",
+        "name": "velocity_p",
+        "object": "0x2010:02",
+        "values": {"axis": old, "object": gain(session, TABLE)},
+    }
 
 
 @pytest.mark.parametrize("folder", ["one", "another"])
