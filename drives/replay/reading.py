@@ -33,10 +33,10 @@ def read_trace(path: Path) -> Generator[can.Message]:
     ProfileError
         If there is no such file, its suffix is none of ``drives.trace.FORMATS``, or it is no trace.
     """
-    if path.suffix.lower() not in FORMATS:
-        raise ProfileError(path, f"is no trace: these end in {', '.join(FORMATS)}")
     if not path.is_file():
         raise ProfileError(path, "no such file")
+    if path.suffix.lower() not in FORMATS:
+        raise ProfileError(path, f"is no trace: these end in {', '.join(FORMATS)}")
     found = 0
     try:
         with _opened(path) as file:

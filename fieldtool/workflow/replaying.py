@@ -141,10 +141,14 @@ def find_source(path: Path, machine: str | None = None) -> Source:
     Raises
     ------
     FileFormatError
-        If there is no trace, or more than one.
+        If the path does not exist, there is no trace, or more than one.
     ProfileError
         If the machine profile is wrong.
     """
+    if not path.exists():
+        raise FileFormatError(
+            path, "does not exist. Give a session folder with a trace, or a trace."
+        )
     folder = SessionFolder(path if path.is_dir() else path.parent)
     if path.is_dir():
         traces = sorted(p for p in path.iterdir() if p.suffix.lower() in FORMATS)

@@ -130,6 +130,16 @@ def test_a_session_without_a_trace(small_bench) -> None:
     assert "has no trace; measure with --trace" in outcome.err
 
 
+@pytest.mark.parametrize("name", ["none", "none.txt", "none.asc", "none/trace.asc"])
+@pytest.mark.parametrize("again", [(), ("--again",)])
+def test_a_path_that_is_not_there(small_bench, name: str, again: tuple[str, ...]) -> None:
+    (small_bench.folder / "machine.yaml").write_text("nonsense: [")
+    path = small_bench.folder / name
+    outcome = small_bench.command("replay", path, *again)
+    assert outcome.code == 2
+    assert f"{path}: does not exist. Give a session folder" in " ".join(outcome.err.split())
+
+
 def test_a_trace_of_somebody_else_is_shown_without_a_machine(tmp_path, small_bench) -> None:
     trace = tmp_path / "other.log"
     trace.write_text("(1.000000) can0 080# R\n(1.010000) can0 705#05 R\n(1.020000) can0 080# R\n")

@@ -89,9 +89,10 @@ def test_what_is_no_trace_is_refused_in_words(
         list(read_trace(path))
 
 
-def test_a_file_that_is_not_there(tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["nothing.asc", "nothing.ascx", "nothing"])
+def test_a_file_that_is_not_there(tmp_path: Path, name: str) -> None:
     with pytest.raises(ProfileError, match="no such file"):
-        list(read_trace(tmp_path / "nothing.asc"))
+        list(read_trace(tmp_path / name))
 
 
 @settings(max_examples=40, deadline=None)
