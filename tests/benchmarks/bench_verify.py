@@ -31,7 +31,8 @@ encoder's steps make of it with the controller that was written.  Nobody without
 in a torque.  In parentheses the same from the first samples whose position is off the twin's by COUNTS
 counts or whose torque is off: a loop of 2 Hz with the wrong sign needs longer than 50 ms to double such
 a way, while its torque is still far below the step in which it is told.  Off is a drive whose statusword
-says so in the PDO of a SYNC.  "Unseen" are those that were stopped before they showed in a torque.
+says so in the PDO of a SYNC.  "Before motion" are those that were stopped while all axes were told to
+stand; "unseen" those that were stopped in motion before they showed in a torque.
 
 Rows are appended to a file (``--out``), so that pieces add up: the same seed goes on where it ended.
 """
@@ -115,6 +116,10 @@ class Heard:
     """Rows after which the user stops."""
     rows: dict[int, list[tuple[float, bool, int, int]]] = field(default_factory=dict)
     """Time, s; whether it is enabled; position, counts; torque, 1/1000."""
+    told: dict[int, int] = field(default_factory=dict)
+    """Target that each drive was told first once it was enabled, counts."""
+    moved: bool = False
+    """Whether a drive that is enabled was told anything but to stand where it stands."""
 
     def __call__(self, nanoseconds: int, cob_id: int, data: bytes) -> None:
         if 0x180 < cob_id < 0x200 and len(data) == 8:
@@ -124,6 +129,15 @@ class Heard:
             rows.append(row)
             if len(rows) == self.most:
                 raise KeyboardInterrupt
+
+    def command(self, cob_id: int, data: bytes) -> None:
+        """Hear what a drive is told."""
+        if 0x200 < cob_id < 0x280 and len(data) == 8:
+            word, target, offset = struct.unpack("<Hih", data)
+            rows = self.rows.get(cob_id - 0x200)
+            if rows and rows[-1][1] and word & 0xF == 0xF:
+                stood = self.told.setdefault(cob_id, target)
+                self.moved |= abs(target - stood) > COUNTS or offset != 0
 
     def stopped_after(self, twin: "Heard", noise: dict[int, float]) -> list[float | None]:
         """Return seconds from where it first shows until no drive has power: in torque; in any signal.
@@ -173,6 +187,12 @@ def planted(seed: int, number: int, disaster: str, cycles: int | None = None) ->
         running = register(CHANNEL, simulated_machine(machine))
         heard = Heard()
         running.listen(heard)
+        receive = running.receive
+
+        def received(cob_id: int, data: bytes | bytearray) -> bool:
+            heard.command(cob_id, bytes(data))
+            return receive(cob_id, data)
+
         before = objects(running)
         node = int(rng.choice([n.node_id for n in running.nodes]))
         faults: dict[str, Fault] = {
@@ -195,6 +215,8 @@ def planted(seed: int, number: int, disaster: str, cycles: int | None = None) ->
             pairs = zip(one._group.drives, one._planned.new, strict=True)
             noise[:] = [drive_loop(*pair).noise for pair in pairs]
             heard.rows.clear()
+            heard.told.clear()
+            heard.moved = False
             heard.most = cycles or np.inf
             if fault is not None:
                 running.inject(fault)
@@ -209,6 +231,7 @@ def planted(seed: int, number: int, disaster: str, cycles: int | None = None) ->
             code: Any = 0
             with (
                 patch.object(Verification, "prove", spoiled),
+                patch.object(running, "receive", received),
                 patch("fieldtool.workflow.verifying.run_trial", tried),
                 contextlib.redirect_stderr(said),
                 contextlib.redirect_stdout(io.StringIO()),
@@ -243,7 +266,7 @@ def judged(seed: int, number: int, disasters: Sequence[str]) -> Iterator[dict[st
         begun = time.process_time()
         row = planted(seed, number, disaster)
         heard, noise = row.pop("heard"), row.pop("noise")
-        row |= {"seed": seed, "number": number, "after": [None, None]}
+        row |= {"seed": seed, "number": number, "after": [None, None], "moved": heard.moved}
         row["seconds"] = time.process_time() - begun
         if disaster in FAULTS and heard.rows:
             timed.append((row, heard, noise))
@@ -394,7 +417,7 @@ def table(seed: int, rows: list[dict[str, Any]]) -> None:
             if disaster in ("none", "rough"):
                 stopped = "its power was cut" in row["said"]
                 expected = not stopped if disaster == "rough" else row["code"] == 0
-            late = (row["after"][0] or 0.0) > SOONEST
+            late = row["moved"] and (row["after"][0] or 0.0) > SOONEST
             if not expected or late:
                 after = f", {1000 * row['after'][0]:.0f} ms" if late else ""
                 print(f"             {row['number']}: {row['code']}{after}: {row['said'][:260]}")
@@ -404,8 +427,9 @@ def _times(rows: list[dict[str, Any]]) -> str:
     """How soon they were stopped, in words; empty for what is not timed."""
     if rows[0]["disaster"] not in FAULTS:
         return ""
-    shown, counted = ([t for row in rows if (t := row["after"][k]) is not None] for k in (0, 1))
-    text = f"{len(rows) - len(shown)} unseen"
+    moved = [row for row in rows if row["moved"]]
+    shown, counted = ([t for row in moved if (t := row["after"][k]) is not None] for k in (0, 1))
+    text = f"{len(rows) - len(moved)} before motion, {len(moved) - len(shown)} unseen"
     for before, times, behind in (("; ", shown, ""), (" (", counted, ")")):
         if times:
             text += (
