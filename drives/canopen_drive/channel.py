@@ -153,7 +153,8 @@ class Channel:
         cycles = 1 + self.missing + self.paused
         self._note_shaking(cycles)
         enabled = self.statusword & ENABLED_MASK == ENABLED_VALUE
-        self.balance.take(self.position, torque, cycles, enabled=enabled)
+        target = OUTPUT.unpack(self.output.data)[1]
+        self.balance.take(self.position, torque, target, cycles, enabled=enabled)
         self._judge_unseen(torque, cycles, enabled)
         self.allowed = ceil(self.step * cycles)
         self._judge_span(cycles)

@@ -285,10 +285,12 @@ class Bench:
     def _watch_energy(self) -> None:
         take, take_all, check = Balance.take, Channel.take, CanopenMotion._check_energy
 
-        def noted(watch: Balance, position: int, torque: int, cycles: float, **more: bool) -> None:
+        def noted(
+            watch: Balance, position: int, torque: int, target: int, cycles: float, **more: bool
+        ) -> None:
             since = self._loses(watch, cycles)
             if since is not None:
-                take(watch, position, torque, since, **more)
+                take(watch, position, torque, target, since, **more)
 
         def counted(channel: Channel, data: bytes) -> None:
             self.samples += 1
