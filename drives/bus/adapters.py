@@ -17,6 +17,7 @@ import can
 from can.interfaces import BACKENDS
 
 from drives.errors import BusError, UserStopError
+from drives.profile import SIMULATED
 
 for _logger in ("can", "seeedbus"):  # what goes wrong is raised, not logged
     logging.getLogger(_logger).setLevel(logging.CRITICAL)
@@ -74,7 +75,7 @@ EXTRAS = {
 }
 """Extras of python-can that an interface needs, or is better with."""
 BITRATE_ELSEWHERE = frozenset(
-    {"socketcan", "serial", "socketcand", "udp_multicast", "virtual", "fieldsim", "fieldreplay"}
+    {"socketcan", "serial", "socketcand", "udp_multicast", "virtual", SIMULATED, "fieldreplay"}
 )
 """Interfaces whose bit rate is set by somebody else, or that have none."""
 

@@ -8,7 +8,7 @@ Files are looked for as given, else among the packaged ones (``profiles/drives``
 ``profiles/machines``) by their name without ``.yaml``.
 """
 
-from drives.profile.bus import BusProfile
+from drives.profile.bus import SIMULATED, BusProfile
 from drives.profile.chain import ChainProfile, CouplingProfile
 from drives.profile.drive import DriveProfile, Identity
 from drives.profile.effects import EffectProfile, MachineEffectProfile
@@ -29,6 +29,7 @@ from drives.profile.yaml_reader import MAX_PROFILE_BYTES, read_yaml
 __all__ = [
     "DIMENSIONS",
     "MAX_PROFILE_BYTES",
+    "SIMULATED",
     "UNKNOWN",
     "AxisProfile",
     "BusProfile",

@@ -6,6 +6,9 @@ from pydantic import Field, StrictBool, StrictFloat, StrictInt, StrictStr
 
 from drives.profile.values import Part, Seconds
 
+SIMULATED = "fieldsim"
+"""python-can interface of the simulated machine in virtual time; its channel may be a file."""
+
 
 class BusProfile(Part):
     """Where the machine's CAN bus is, in python-can's words."""

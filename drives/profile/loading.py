@@ -9,15 +9,12 @@ from typing import Any, Literal, TypeVar
 from pydantic import ValidationError
 
 from drives.errors import ProfileError
-from drives.profile.bus import BusProfile
+from drives.profile.bus import SIMULATED, BusProfile
 from drives.profile.drive import DriveProfile
 from drives.profile.machine import MachineProfile
 from drives.profile.plain_words import place_words, problem_words, unit_of
 from drives.profile.values import LocatedError
 from drives.profile.yaml_reader import Lines, Location, line_of, read_yaml
-
-SIMULATED = "fieldsim"
-"""Interface of simulated machines; its channel may be a file."""
 
 
 def load_machine(name_or_path: str | Path) -> MachineProfile:

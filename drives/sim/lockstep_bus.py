@@ -20,12 +20,12 @@ from can.typechecking import AutoDetectedConfig, CanFilters, Channel
 
 from drives.bus import is_data
 from drives.errors import DrivesError
+from drives.profile import SIMULATED
 from drives.sim.firmware import SimulationDivergedError
 from drives.sim.machine import SimulatedMachine, simulated_machine
 from drives.sim.running import CycleTimeError, RunningMachine
 from drives.sim.scheduler import NANOSECONDS, Timer, nanoseconds
 
-INTERFACE = "fieldsim"
 SILENCE_LIMIT = 60.0
 """Virtual seconds after which ``recv(timeout=None)`` gives up: nothing will ever come."""
 
@@ -177,12 +177,12 @@ class LockstepBus(can.BusABC):
     ) -> None:
         if unknown:
             raise TypeError(
-                f"{INTERFACE} has no option {', '.join(sorted(unknown))}; it has channel, "
+                f"{SIMULATED} has no option {', '.join(sorted(unknown))}; it has channel, "
                 "can_filters, machine, receive_own_messages, bitrate"
             )
         if not 10_000 <= int(bitrate) <= 1_000_000:
             raise can.CanInitializationError(
-                f"{INTERFACE}: bit rate {bitrate} bit/s is not within 10 000 and 1 000 000"
+                f"{SIMULATED}: bit rate {bitrate} bit/s is not within 10 000 and 1 000 000"
             )
         self._queue: deque[Entry] = deque()
         self._frame_came = threading.Condition()
@@ -194,8 +194,8 @@ class LockstepBus(can.BusABC):
         self.drives_begin_anew = machine is None and not known
         """Whether its drives were switched on with this bus, and end with the last one."""
         self._line = _open(channel, machine)
-        self.channel = str(channel) if channel is not None else INTERFACE
-        self.channel_info = f"{INTERFACE} {self.channel}: simulated machine in virtual time"
+        self.channel = str(channel) if channel is not None else SIMULATED
+        self.channel_info = f"{SIMULATED} {self.channel}: simulated machine in virtual time"
         self.clock: Clock = self._line
         """Virtual time; the host paces itself by it."""
         super().__init__(channel=self.channel, can_filters=can_filters)
@@ -343,7 +343,7 @@ class LockstepBus(can.BusABC):
     @state.setter
     def state(self, new_state: can.BusState) -> None:
         if new_state is not can.BusState.ACTIVE:
-            raise NotImplementedError(f"{INTERFACE} is always active, it can not be {new_state}")
+            raise NotImplementedError(f"{SIMULATED} is always active, it can not be {new_state}")
 
     def flush_tx_buffer(self) -> None:
         """Do nothing: nothing waits to be sent."""
@@ -362,7 +362,7 @@ class LockstepBus(can.BusABC):
     def _detect_available_configs() -> Sequence[AutoDetectedConfig]:
         machines = files("profiles").joinpath("machines").iterdir()
         packaged = (m.name.removesuffix(".yaml") for m in machines if m.name.endswith(".yaml"))
-        return [{"interface": INTERFACE, "channel": name} for name in (*_registered, *packaged)]
+        return [{"interface": SIMULATED, "channel": name} for name in (*_registered, *packaged)]
 
 
 class _VirtualCyclicTask(
@@ -464,7 +464,7 @@ def _forget_unless_open(line: _Line) -> None:
 def _of_channel(channel: Channel | None) -> RunningMachine:
     if channel is None or channel == "":
         raise can.CanInitializationError(
-            f"{INTERFACE} needs a channel (name of a machine) or a machine"
+            f"{SIMULATED} needs a channel (name of a machine) or a machine"
         )
     name = str(channel)
     running = _registered.get(name) or _open_channels.get(name)
@@ -479,7 +479,7 @@ def _load(name: str) -> RunningMachine:
     try:
         return RunningMachine(simulated_machine(load_machine(name)))
     except (DrivesError, ValueError, KeyError) as error:
-        raise can.CanInitializationError(f"{INTERFACE}: {error}") from error
+        raise can.CanInitializationError(f"{SIMULATED}: {error}") from error
 
 
 def _message(entry: Entry) -> can.Message:

@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.text import Text
 
 from fieldtool import workflow
-from fieldtool.cli.options import check_picture
+from fieldtool.cli.options import check_output
 from fieldtool.cli.output import Json, console_of, indented, print_json
 from fieldtool.cli.progress import ShareBar
 from fieldtool.cli.sheet import Sheet
@@ -43,7 +43,8 @@ def criticise(
     as_json: Json = False,
 ) -> None:
     """Say what the simulation of a recording gets wrong, name causes, measure the gain."""
-    check_picture("--picture", picture)
+    check_output("--picture", picture)
+    check_output("--report", report)
     console = console_of(as_json)
     with ShareBar(console, "simulate") as bar:
         found = workflow.criticise(source, model, picture, bar, report)

@@ -11,7 +11,7 @@ from rich.text import Text
 
 from drives.units import Kind, unit_on
 from fieldtool import workflow
-from fieldtool.cli.options import ResponseChoice, check_picture, check_response
+from fieldtool.cli.options import ResponseChoice, check_output, check_response
 from fieldtool.cli.output import Json, console_of, indented, print_json
 from fieldtool.cli.progress import ShareBar
 from fieldtool.cli.sheet import Sheet
@@ -71,7 +71,7 @@ def design(
 ) -> None:
     """Design controller parameters from the session folder's model, and predict what they do."""
     check_response(response)
-    check_picture("--png", png)
+    check_output("--png", png)
     if not 1.1 < bound <= MOST_BOUND:
         raise typer.BadParameter(
             f"--bound is a number above 1.1, and {MOST_BOUND:g} at most; got {bound:g}"

@@ -10,7 +10,6 @@ from rich.text import Text
 from drives.profile import MachineProfile
 from fieldtool import workflow
 from fieldtool.cli.criticise import show_criticism
-from fieldtool.cli.output import print_json
 from fieldtool.cli.screen import TerminalScreen
 from fieldtool.cli.stop_key import StopKey
 from fieldtool.cli.stoppable import StoppableScreen
@@ -44,4 +43,4 @@ def tell_apart(
     console.print(Text(done.answer, style="bold"))
     console.print(Text(f"Both recordings, criticism and report are in {folder}."))
     if as_json:
-        print_json({**done.as_dict(), "not_put_back": list(screen.left)})
+        screen.print_json(done.as_dict())

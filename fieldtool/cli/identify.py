@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from fieldtool import workflow
-from fieldtool.cli.options import Motor, Seconds, check_picture, options_of
+from fieldtool.cli.options import Motor, Seconds, check_output, options_of
 from fieldtool.cli.output import Json, console_of, indented, print_json
 from fieldtool.cli.screen import TerminalScreen, model_table
 
@@ -30,7 +30,7 @@ def identify(
     as_json: Json = False,
 ) -> None:
     """Identify masses, springs, couplings and dampers from a recording."""
-    check_picture("--picture", picture)
+    check_output("--picture", picture)
     console = console_of(as_json)
     options = options_of("fast", False, False, motor_inertia, seconds)
     planned, lengths = None, _lengths(masses or [])

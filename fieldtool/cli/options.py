@@ -115,12 +115,12 @@ def check_response(response: str) -> None:
         raise typer.BadParameter(f"--response is one of {', '.join(RESPONSES)}, got {response!r}")
 
 
-def check_picture(option: str, picture: Path | None) -> None:
-    """Refuse a picture that could not be written, before anything is computed for it."""
-    if picture is None:
+def check_output(option: str, file: Path | None) -> None:
+    """Refuse a file that could not be written, before anything is computed for it."""
+    if file is None:
         return
     try:
-        check_writable(picture)
+        check_writable(file)
     except OutputError as error:
         raise typer.BadParameter(f"{option}: {error}") from None
 

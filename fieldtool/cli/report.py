@@ -7,6 +7,7 @@ import typer
 from rich.text import Text
 
 from fieldtool import workflow
+from fieldtool.cli.options import check_output
 from fieldtool.cli.output import Json, console_of, print_json
 
 
@@ -19,6 +20,7 @@ def report(
     as_json: Json = False,
 ) -> None:
     """Put everything about a session on one page: an HTML file that needs no network."""
+    check_output("--out", out)
     path = workflow.report(folder, out)
     size = path.stat().st_size
     console_of(as_json).print(

@@ -76,7 +76,7 @@ def run(
     with noting("" if result.write_back is None else result.write_back.way_back):
         show_result(console, result, listed=ask.refused)
         if as_json:
-            print_json({**result.as_dict(), "not_put_back": list(screen.left)})
+            screen.print_json(result.as_dict())
     ask.end()
     screen.end()
 
@@ -160,7 +160,7 @@ def measure(
     console.print(f"{seconds:.0f} s of excitation; the recording is in {folder}")
     if as_json:
         times = {"excitation_s": seconds, "machine_s": seconds}
-        print_json({"folder": str(folder), "time": times, "not_put_back": list(screen.left)})
+        screen.print_json({"folder": str(folder), "time": times})
     screen.end()
 
 

@@ -12,7 +12,7 @@ from rich.progress import SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.text import Text
 
 from fieldtool.cli.design import show_tuning
-from fieldtool.cli.output import indented
+from fieldtool.cli.output import indented, print_json
 from fieldtool.cli.progress import Left, bar_of, clock, long, short
 from fieldtool.cli.sheet import Sheet
 from fieldtool.design.tuning import Tuning
@@ -220,6 +220,10 @@ class TerminalScreen:
     def not_put_back(self, axes: Sequence[str], sentence: str) -> None:
         """Keep for the command's end what stands among the warnings already."""
         self.left, self._left_words = tuple(axes), sentence
+
+    def print_json(self, data: Mapping[str, Any]) -> None:
+        """Print what a command that moves axes has done as one JSON object."""
+        print_json({**data, "not_put_back": list(self.left)})
 
     def end(self) -> None:
         """End a command that has done and shown all it was to.

@@ -139,7 +139,7 @@ def switch(
         if result.in_memory:
             console.print(indented(_taken_back(result)))
         if as_json:
-            print_json({**written_as_dict(folder, result), "not_put_back": list(screen.left)})
+            screen.print_json(written_as_dict(folder, result))
     ask.end()
     screen.end()
 

@@ -47,7 +47,7 @@ def write(
         if as_json:
             trial = verified.as_dict() if verified else None
             done = written_as_dict(folder, result) | {"verification": trial}
-            print_json({**done, "not_put_back": list(screen.left)})
+            screen.print_json(done)
     ask.end()
     screen.end()
 

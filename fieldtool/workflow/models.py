@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from drives.errors import ProfileError
-from drives.profile import MachineProfile
+from drives.profile import SIMULATED, MachineProfile
 from fieldtool.errors import FileFormatError, IdentificationError, PlanRefusedError
 from fieldtool.experiment.plausible import FAR_OFF
 from fieldtool.records.model import AxisModel, Coupling, Estimate, FloatArray, MachineModel
@@ -101,7 +101,7 @@ def check_believable(found: MachineModel, prior: MachineModel) -> None:
 
 def is_simulated(machine: MachineProfile) -> bool:
     """Whether its bus is that of a machine simulated in this process."""
-    return machine.simulation is not None and machine.bus.interface == "fieldsim"
+    return machine.simulation is not None and machine.bus.interface == SIMULATED
 
 
 def truth_model(machine: MachineProfile) -> MachineModel | None:

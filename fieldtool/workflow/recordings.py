@@ -5,7 +5,7 @@ from pathlib import Path
 
 from drives.bus import close_bus, open_bus
 from drives.errors import BusError, ProfileError
-from drives.profile import MachineProfile, load_machine
+from drives.profile import SIMULATED, MachineProfile, load_machine
 from fieldtool.errors import NotEnoughDataError
 from fieldtool.identify.prediction import LoadPrediction, predict_load
 from fieldtool.identify.recorded import identify_recording
@@ -18,9 +18,6 @@ from fieldtool.records.recording import (
     save,
 )
 from fieldtool.records.session_folder import SessionFolder
-
-VIRTUAL_TIME = "fieldsim"
-"""python-can interface of the simulated machine in virtual time."""
 
 
 def import_folder(folder: Path, out: Path) -> Recording:
@@ -119,9 +116,9 @@ def simulate(
         raise ProfileError(
             profile.path, "has no `simulation` section, so it can not be simulated. Add one."
         )
-    if profile.bus.interface == VIRTUAL_TIME:
+    if profile.bus.interface == SIMULATED:
         raise BusError(
-            f"{VIRTUAL_TIME} brings its own simulated machine, in virtual time. Serve nodes on a bus "
+            f"{SIMULATED} brings its own simulated machine, in virtual time. Serve nodes on a bus "
             "that another program can reach: --interface socketcan --channel vcan0."
         )
     running = RunningMachine(simulated_machine(profile))

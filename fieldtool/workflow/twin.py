@@ -10,7 +10,7 @@ import yaml
 
 from drives.errors import ProfileError
 from drives.parameters import load_backup
-from drives.profile import AxisProfile, MachineProfile, load_drive, load_machine
+from drives.profile import SIMULATED, AxisProfile, MachineProfile, load_drive, load_machine
 from drives.sim.faces import face_names
 from fieldtool.errors import FileFormatError, PlanRefusedError
 from fieldtool.frf.velocity_band import white_noise
@@ -118,7 +118,7 @@ def _data(
     data["name"] = f"{machine.name}-twin"[:60]
     data["description"] = f"Simulated from the session {folder.path.resolve().name}."
     data["bus"] = {
-        "interface": "fieldsim",
+        "interface": SIMULATED,
         "channel": str(path.resolve()),
         "bitrate": machine.bus.bitrate,
     }

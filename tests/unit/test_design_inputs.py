@@ -486,10 +486,17 @@ def test_what_stands_against_a_design_is_said_with_what_can_still_be_done(
 
 @pytest.mark.parametrize(
     ("command", "option"),
-    [("design", "--png"), ("identify", "--picture"), ("criticise", "--picture")],
+    [
+        ("design", "--png"),
+        ("identify", "--picture"),
+        ("criticise", "--picture"),
+        ("criticise", "--report"),
+        ("report", "--out"),
+        ("import", "--out"),
+    ],
 )
 @pytest.mark.parametrize(
-    ("picture", "words"),
+    ("name", "words"),
     [
         (".", "is a folder"),
         ("none/one.png", "there is no folder"),
@@ -497,19 +504,19 @@ def test_what_stands_against_a_design_is_said_with_what_can_still_be_done(
         (f"{'n' * 250}.png", "can not be written"),
     ],
 )
-def test_a_picture_that_can_not_be_written_is_refused_before_anything(
+def test_a_file_that_can_not_be_written_is_refused_before_anything(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
     command: str,
     option: str,
-    picture: str,
+    name: str,
     words: str,
 ) -> None:
     """A design anew had taken the place of the one before by then."""
     folder = session(tmp_path, ("reference", "reference"), backup=False)
     folder.tuning.write_text("as it was")
     before = sorted(folder.path.iterdir())
-    assert main_code([command, str(folder.path), option, str(folder.path / picture)]) == 2
+    assert main_code([command, str(folder.path), option, str(folder.path / name)]) == 2
     said = capsys.readouterr().err
     assert option in said
     assert words in " ".join(said.replace("│", " ").split())
