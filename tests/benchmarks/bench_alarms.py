@@ -6,7 +6,8 @@ loops, noisy torques, prior masses wrong by up to a factor of two, slow and fast
 axes one thing more: weights, magnets that cog, parts that hang on springs, what shakes the machine,
 delays, encoder errors.  And every third one of ``bench_retune``: one to three coupled axes of one to
 three masses.  Each is measured by the fast plan on the lock-step bus, as a user would.  Of every second
-machine the watches do not get 4 % of the samples, as on a bus that loses cycles.
+machine the watches do not get 4 % of the samples, as on a bus that loses cycles; of every second pair
+of machines a third of the SYNCs comes late, by 3 % of a cycle in the mean.
 
 A false alarm is exit code 4, but for a torque above its limit, which is true where it is said.
 ``dead``, ``pushed`` and ``energy`` are the worst shares of the watches' bounds that sound axes came
@@ -42,6 +43,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 from drives.canopen_drive.channel import Channel
 from drives.canopen_drive.energy import Balance
 from drives.canopen_drive.motion import CanopenMotion
+from drives.canopen_drive.pace import LATE_SHARE
+from drives.canopen_drive.sync import Early, HostSync
 from drives.canopen_drive.unseen import STOOD, Unseen
 from drives.profile import load_machine
 from drives.sim.faults import MotorReversed
@@ -60,6 +63,9 @@ SAG = 0.003
 """rad by which a weight may pull an axis down before its loop holds it."""
 LOST = 0.04
 """Share of the samples that the watch does not get, of every second machine."""
+LATE, LATE_BY = 0.3, 0.03
+"""Share of the SYNCs that come late, of every second pair of machines; by so much of a cycle, in the
+mean, but not so late that the cycle counts as a late one."""
 worst = {"dead": 0.0, "pushed": 0.0, "energy": 0.0}
 
 
@@ -189,7 +195,8 @@ def main() -> int:
         profile, said = drawn_machine(np.random.default_rng([seed, k]), k)
         worst.update(dead=0.0, pushed=0.0, energy=-1.0)
         bench.loses = LOST * (k % 2)
-        said += ", cycles lost" * (k % 2)
+        bench.late = k // 2 % 2 == 1
+        said += ", cycles lost" * (k % 2) + ", SYNC late" * bench.late
         code, text = bench.measured(profile)
         alarm = code == 4 and "is above the limit" not in text
         false += alarm
@@ -245,17 +252,18 @@ class Stop:
 class Bench:
     """Simulated machines behind the command line, and how near the watches come to their bounds.
 
-    ``loses`` is the share of the samples that watches do not get.
+    ``loses`` is the share of the samples that watches do not get, ``late`` whether SYNCs come late.
     """
 
     def __init__(self, rng: np.random.Generator) -> None:
-        self.loses = 0.0
+        self.loses, self.late = 0.0, False
         self.samples = 0
         """That channels took in the last measurement."""
         self._rng, self._lost = rng, dict[int, float]()
         self._seen: Callable[[], None] = lambda: None
         self._watch_unseen()
         self._watch_energy()
+        self._have_late_syncs()
 
     def _loses(self, watch: object, cycles: float) -> float | None:
         """Return the cycles since a watch's last sample; None where it does not get this one."""
@@ -264,6 +272,19 @@ class Bench:
             self._lost[id(watch)] = cycles
             return None
         return cycles
+
+    def _have_late_syncs(self) -> None:
+        give = HostSync.give
+
+        def given(sync: HostSync, early: Early) -> float:
+            if self.late and self._rng.random() < LATE:
+                clock, cycle = sync._line.clock, sync._cycle_time
+                late = min(self._rng.exponential(LATE_BY), LATE_SHARE / 2) * cycle
+                clock.wait_until(clock.now() + late)
+                sync._start += late  # virtual time goes on by whole cycles from there
+            return give(sync, early)
+
+        HostSync.give = given  # type: ignore[method-assign]
 
     def _watch_unseen(self) -> None:
         take = Unseen.take
