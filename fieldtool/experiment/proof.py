@@ -194,7 +194,7 @@ class Proof:
             self._resting += position.tolist()
             self._pulls += torque.tolist()
             return
-        noise = max(self._resting) - min(self._resting)
+        noise = self._noise
         beyond = max(SHOWN_COUNTS * float(self._axes.counts[self._k]), NOISE_SHARE * noise)
         # friction may let go of it on either side of where it stood: what counts is from end to end
         self._reached = [*self._reached, *position.tolist()]
@@ -205,21 +205,33 @@ class Proof:
             most = float(np.abs(torque - np.mean(self._pulls)).max())
             self._torque = max(self._torque, most)
 
+    @property
+    def _noise(self) -> float:
+        """By how much its position changed at rest, rad or m."""
+        return max(self._resting) - min(self._resting)
+
     def _refuse(self) -> None:
         """Raise SafetyStopError if torque enough was given, and nothing moved; power has to be cut."""
         axes, k = self._axes, self._k
         limit = axes.limits[k].torque
         if self.answered or self._torque < PROOF_ENOUGH * limit:
             return
-        name, rotary = axes.names[k], axes.unit(k) == "rad"
+        name, unit, counts = axes.names[k], axes.unit(k), float(axes.counts[k])
+        shaken = self._noise > SHOWN_COUNTS * counts
+        changed = (
+            f"by {np.ptp(self._reached):.2g} {unit}, and at rest it did by {self._noise:.2g} {unit}"
+            if shaken
+            else f"by less than {ceil(SHOWN_COUNTS)} counts"
+        )
+        hides = "something shakes it by more than these pulses do, " if shaken else ""
         raise SafetyStopError(
             f"{name}: does not move by its encoder: short pulses of torque up to {self._torque:.3g} "
-            f"{'N m' if rotary else 'N'} ({100 * self._torque / limit:.0f} % of its limit) changed its "
-            f"position by less than {ceil(SHOWN_COUNTS)} counts; its power was cut and all axes were "
-            f"stopped. Without friction it has moved by at most {self._unseen():.2g} "
-            f"{axes.unit(k)}. Either its encoder does not count (cable, supply), or it is blocked, its "
-            "brake is closed, or friction holds it. All look the same from here: turn it by hand with "
-            "the power off, and see whether its position changes.",
+            f"{'N m' if unit == 'rad' else 'N'} ({100 * self._torque / limit:.0f} % of its limit) "
+            f"changed its position {changed}; its power was cut and all axes were stopped. Without "
+            f"friction it has moved by at most {self._unseen():.2g} {unit}. Either its encoder does "
+            f"not count (cable, supply), or {hides}it is blocked, its brake is closed, or friction "
+            "holds it. All look the same from here: turn it by hand with the power off, and see "
+            "whether its position changes.",
             axis=name,
             runaway=True,
         )

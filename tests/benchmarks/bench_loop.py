@@ -161,12 +161,12 @@ def one_run(cycle: float, sync: str) -> None:
     listener = KernelBus("vcan0")
     listener.socket.setsockopt(1, 33, 32_000_000)
     spoiled = rows = 0
+    first = float("inf")
     try:
         with connect(machine) as group:
             try:
                 with group.motion(cycle) as motion:
-                    while listener.recv(0) is not None:
-                        pass
+                    first = time.time()
                     begun, cpu = time.perf_counter(), time.process_time()
                     capture = motion.stream(waves(motion.position, cycle, SECONDS))
                     wall, cpu = time.perf_counter() - begun, time.process_time() - cpu
@@ -177,6 +177,8 @@ def one_run(cycle: float, sync: str) -> None:
     finally:
         stamps, lengths = [], []
         while (message := listener.recv(0)) is not None and len(stamps) < (rows or 1):
+            if message.timestamp < first:
+                continue
             lengths.append(len(message.data))
             if message.arbitration_id == 0x080:
                 stamps.append(message.timestamp)

@@ -156,6 +156,31 @@ def test_what_goes_to_and_fro_has_moved():
     assert one.answered
 
 
+def test_an_axis_that_is_shaken_is_told_by_how_much(fresh_rng):
+    """It was said to have moved by less than 3 counts, which a look at the screen disproves."""
+    one = Proof(AXES, 1, np.zeros(2), STEP, np.full(2, 1e-4), lambda *_: None)
+    capture, rows_done, frequency = None, 0, float(fresh_rng.uniform(11.0, 40.0))
+    with pytest.raises(SafetyStopError) as stop:
+        while (targets := one(capture)) is not None:
+            rows = targets.position.shape[0]
+            swing = (
+                20 * COUNT * np.sin(2 * np.pi * frequency * STEP * (rows_done + np.arange(rows)))
+            )
+            position = np.stack([np.zeros(rows), swing], axis=1)
+            words = np.zeros((rows, 2), dtype=np.uint16)
+            capture = Capture(rows_done, targets.position, position, targets.torque_offset, words)
+            rows_done += rows
+    said = str(stop.value)
+    assert "something shakes it by more than these pulses do" in said
+    assert "counts" not in said
+    changed, rest = (
+        float(said.partition(words)[2].split(maxsplit=1)[0])
+        for words in ("position by", "it did by")
+    )
+    assert changed == pytest.approx(40 * COUNT, rel=0.1)
+    assert rest == pytest.approx(40 * COUNT, rel=0.1)
+
+
 def test_the_first_pulses_are_enough_without_friction():
     motors = Motors()
     assert proof(motors).answered
