@@ -77,7 +77,8 @@ def written(
     UserStopError
         If the user stopped; where the write had ended, a note says so.
     NotPutBackError
-        If drives hold what the measurement had set for its time; nothing was written.
+        If drives hold what the measurement, or the old parameters' trial, had set for its time; nothing
+        was written.
     """
     if not options.write:
         try:
@@ -93,8 +94,7 @@ def written(
             "only parameters that were tried on the machine are stored: leave --no-verify or --store "
             "away. Nothing was written."
         )
-    if left := left_axes(group.drives):
-        raise NotPutBackError(f"{left_words(left, session.folder.path)}. Nothing was written.")
+    _refuse_left(session, group)
     refuse_other_drives(session.folder.parameters_before, group.drives)
     verification, never = None, why_not_stored(tuning.bound, identified=believed)
     if options.verify:
@@ -129,6 +129,7 @@ def written(
                 if ask_to_move and not session.ready():
                     raise UserStopError("not begun: nothing was moved")
                 verification.before()
+                _refuse_left(session, group)
             _forget_earlier(session)
             session.screen.stage("Write the new parameters, and read them back")
             return True
@@ -175,6 +176,12 @@ def _before_the_write() -> Iterator[None]:
         if not isinstance(error, OscillationError):  # which says so
             error.add_note("That was before the write: nothing was written.")
         raise
+
+
+def _refuse_left(session: Session, group: CanopenGroup) -> None:
+    """Write nothing into drives that still hold what a motion had set for its time."""
+    if left := left_axes(group.drives):
+        raise NotPutBackError(f"{left_words(left, session.folder.path)}. Nothing was written.")
 
 
 def _again(session: Session, *, store: bool) -> str:

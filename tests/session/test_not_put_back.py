@@ -10,19 +10,28 @@ import pytest
 from drives.sim.faults import Abort, SdoSilent
 from fieldtool.errors import NotEnoughDataError
 from tests.session.conftest import axis, one_axis, simulated
+from tests.tunings import begun
 
-TABLE = 11
+TABLE, ARM = 11, 12
 FEED_FORWARD = (0x2010, 4)
+ABORT_CONNECTION = (0x6007, 0)
+GAINS = [b"\x10\x20" + bytes([k]) for k in (1, 2, 3)]
+READ = 0x40
 REFUSED = "table, object 0x2010:04: the drive refused"
 LEFT = "table: not everything is as it was before. Once all drives can be reached again: "
 
 
+def refuse(bench, place, refused):
+    """Have the table refuse such values of an object; return what undoes it."""
+    guards = bench.machine.node(TABLE).dictionary.guards
+    own = guards.get(place, lambda _: None)
+    guards[place] = lambda value: own(value) or (Abort.WRONG_STATE if refused(value) else None)
+    return lambda: guards.update({place: own})
+
+
 def keep_it_off(bench):
     """Have the table let its feed-forward be switched off, and not on again; return what undoes it."""
-    guards = bench.machine.node(TABLE).dictionary.guards
-    own = guards[FEED_FORWARD]
-    guards[FEED_FORWARD] = lambda value: own(value) or (Abort.WRONG_STATE if value else None)
-    return lambda: guards.update({FEED_FORWARD: own})
+    return refuse(bench, FEED_FORWARD, bool)
 
 
 @pytest.fixture
@@ -77,6 +86,20 @@ def test_nothing_is_written_into_drives_that_are_not_as_they_were(stuck):
     assert REFUSED in outcome.err
     assert stuck.changed()[TABLE].keys() == {"0x2010:04"}
     left_until_restored(stuck, outcome, stuck.out)
+
+
+def test_nothing_is_written_after_a_trial_of_the_old_parameters_that_left_something(bench):
+    begun(bench)
+    bench.heal = refuse(bench, ABORT_CONNECTION, lambda value: value == 1)
+    bench.listen()
+    outcome = bench.command("write", bench.out, "--yes")
+    asked = [f.data for f in bench.heard() if f.cob_id in (0x600 + TABLE, 0x600 + ARM)]
+    assert {data[0] for data in asked if data[1:4] in GAINS} == {READ}
+    assert f"{LEFT}fieldtool restore {bench.out}. Nothing was written." in outcome.err
+    assert "Try the old parameters" in outcome.out
+    assert "Try the new parameters" not in outcome.out
+    assert bench.changed()[TABLE] == {"0x6007:00": (1, 3)}
+    left_until_restored(bench, outcome, bench.out)
 
 
 def test_another_error_keeps_its_own_code_and_says_what_is_left(stuck, monkeypatch):
