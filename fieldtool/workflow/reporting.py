@@ -60,8 +60,8 @@ def report(folder_path: Path, out: Path | None = None) -> Path:
 def renewing_report(folder_path: Path, say: Callable[[str], None]) -> Iterator[None]:
     """Renew the report that a session folder has when the work inside ends, however it ends.
 
-    A folder without a report gets none.  Why the report can not be renewed is said, and noted at an
-    error that is on its way; it is no error itself.
+    A folder without a report gets none.  Why the report is not renewed, a stop by the user included, is
+    said, and noted at an error that is on its way; it is no error itself.
     """
     try:
         yield
@@ -77,9 +77,11 @@ def _renew(folder: SessionFolder, say: Callable[[str], None]) -> None:
         return
     try:
         report(folder.path)
-    except UserStopError as error:
-        error.add_note(f"{folder.report} was not renewed yet; all else was done.")
-        raise
+    except (UserStopError, KeyboardInterrupt):  # the work that is reported had ended
+        say(
+            f"You stopped the report from being renewed, {folder.report} shows what was so before. To "
+            f"renew it: `fieldtool report {folder.path}`"
+        )
     except Exception as error:  # a defect of the report, too: what is reported was done
         say(f"The report was not renewed, {folder.report} shows what was so before: {error}")
 

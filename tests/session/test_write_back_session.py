@@ -27,6 +27,7 @@ from drives.sim.faults import (
 )
 from drives.sim.wire import unchanged
 from fieldtool.errors import OutputError
+from fieldtool.workflow import reporting
 from tests.tunings import begun
 from tests.untried import Stood
 
@@ -687,6 +688,44 @@ def test_a_report_that_can_not_be_renewed_hides_nothing(session, monkeypatch):
     assert outcome.code == 6
     assert "arm, velocity_i, object 0x2010:03: the drive holds" in outcome.err
     assert "The report was not renewed" in outcome.err
+    assert (session.out / "report.html").read_bytes() == before
+
+
+def pressing_while_renewing(monkeypatch):
+    """Have Ctrl-C pressed when a report is renewed, so long after a motion that nothing polls."""
+    monkeypatch.setattr("fieldtool.cli.stop_key.ASKED_WITHIN", -1.0)
+    write_page = reporting.write_page
+
+    def pressing(*arguments):
+        signal.raise_signal(signal.SIGINT)
+        write_page(*arguments)
+
+    monkeypatch.setattr(reporting, "write_page", pressing)
+
+
+def test_a_stop_while_the_report_is_renewed_hides_nothing(session, monkeypatch):
+    assert session.command("report", session.out).code == 0
+    before = (session.out / "report.html").read_bytes()
+    to_renew = f"To renew it: `fieldtool report {session.out}`"
+    pressing_while_renewing(monkeypatch)
+    outcome = write(session, "--json")
+    assert outcome.code == 0, outcome.err
+    assert json.loads(outcome.out)["written"]
+    said = " ".join(outcome.err.split())
+    assert to_renew in said
+    assert "working memory only" in said
+    outcome = session.command("restore", session.out, "--json")
+    assert outcome.code == 0, outcome.err
+    assert json.loads(outcome.out)["drives"]
+    said = " ".join(outcome.err.split())
+    assert to_renew in said
+    assert "parameters differed and were restored" in said
+    guards = session.machine.node(ARM).dictionary.guards
+    monkeypatch.setitem(guards, VELOCITY_I, lambda _: 0x08000022)
+    outcome = write(session, "--no-verify")
+    assert outcome.code == 6
+    assert "arm, velocity_i, object 0x2010:03: the drive holds" in outcome.err
+    assert to_renew in outcome.err
     assert (session.out / "report.html").read_bytes() == before
 
 

@@ -1,6 +1,8 @@
 """What a design is told of drives: from a backup as from the drive itself; what is said where not."""
 
+import json
 import re
+import signal
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
@@ -138,6 +140,36 @@ def test_a_report_that_is_there_is_renewed_by_a_design(
     assert "The report was not renewed, " in said
     assert "shows what was so before: no room" in said
     assert folder.report.read_text(encoding="utf-8") == page
+
+
+def test_a_stop_while_the_report_is_renewed_does_not_hide_a_design(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = session(tmp_path, ("reference", "reference"))
+    folder.note("session", command="measure")
+    folder.report.write_text("an older state")
+
+    def stopped(*_: object) -> None:
+        signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr("fieldtool.workflow.reporting.write_page", stopped)
+    assert main_code(["design", str(folder.path), "--response", "soft", "--json"]) == 0
+    told = capsys.readouterr()
+    assert json.loads(told.out)["axes"]
+    said = " ".join(told.err.split())
+    assert f"To renew it: `fieldtool report {folder.path}`" in said
+    assert f"Kept in {folder.path}; " in said
+
+    def fails(*_: object) -> None:
+        raise OutputError("no room")
+
+    monkeypatch.setattr("fieldtool.workflow.designing.draw_design", fails)
+    picture = ("--png", str(tmp_path / "design.png"))
+    assert main_code(["design", str(folder.path), "--response", "soft", *picture]) == 3
+    said = " ".join(capsys.readouterr().err.split())
+    assert said.startswith("fieldtool: no room")
+    assert f"To renew it: `fieldtool report {folder.path}`" in said
+    assert folder.report.read_text(encoding="utf-8") == "an older state"
 
 
 def test_the_command_says_what_is_there_and_what_will_be(
