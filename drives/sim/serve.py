@@ -65,10 +65,10 @@ def serve(
 ) -> Served:
     """Let the nodes of a machine live on a bus until ``stop`` returns True.
 
-    Frames are handled as they come; a SYNC latches inputs and lets outputs act at the moment at
-    which it is received.  Time passes by the wall clock, so the drives' behaviour has the jitter
-    of this computer.  A bus that goes away does not stop the drives: they miss frames, and time
-    passes for them, as for real ones whose cable was pulled.
+    A SYNC latches inputs and lets outputs act at the moment at which it came, by its time stamp where
+    that is one of this computer's clock, as in a drive that handles it at once; what the nodes answer
+    is as late as this computer is.  Time passes by the wall clock.  A bus that goes away does not stop
+    the drives: they miss frames, and time passes for them, as for real ones whose cable was pulled.
 
     Parameters
     ----------
@@ -103,10 +103,11 @@ def _served(
         while not stop():
             message = line.receive()
             present = clock()
+            waits = 0.0 if message is None else _age(message)
             pause, last = present - last, present
             waited = pause - (WAIT if message is None else 0.0)
             late, worst = late + (waited > LATE), max(worst, waited)
-            now = virtual_began + int((present - began - left_out) * NANOSECONDS)
+            now = virtual_began + int((present - waits - began - left_out) * NANOSECONDS)
             behind = (now - machine.time) / NANOSECONDS
             if behind > LARGEST_STEP:
                 left_out += behind - LARGEST_STEP
@@ -118,6 +119,12 @@ def _served(
     finally:
         line.close()
     return Served(last - began, line.frames, late, worst, left_out, line.away)
+
+
+def _age(message: can.Message) -> float:
+    """Return for how long a frame has waited, s; 0 where its stamp is of another clock."""
+    age = time.time() - message.timestamp
+    return age if 0.0 < age <= LARGEST_STEP else 0.0
 
 
 class _Line:

@@ -393,6 +393,26 @@ class TestServing:
         assert report.left_out == pytest.approx(9.95)
         assert report.worst == pytest.approx(10.0, abs=0.01)
 
+    @pytest.mark.parametrize(("ago", "now"), [(0.03, 0.01), (1e6, 0.04), (-5.0, 0.04)])
+    def test_a_frame_acts_at_the_moment_at_which_it_came(self, ago, now):
+        """A drive handles it at once; a stamp of another clock tells nothing."""
+
+        class Kept(type(can.Bus(interface="virtual", channel="kept"))):
+            def recv(self, timeout=None):
+                message = super().recv(timeout)
+                if message is not None:
+                    message.timestamp = time.time() - ago
+                return message
+
+        running = RunningMachine(machine())
+        ticks = iter((0.0, 0.04))
+        stops = iter((False, True))
+        with Kept(channel="kept") as far, can.Bus(interface="virtual", channel="kept") as near:
+            near.send(SYNC)
+            serve(running, far, lambda: next(stops), clock=lambda: next(ticks))
+        assert running.sync_count == 1
+        assert now - 0.009 < running.now <= now + 1e-6
+
     def test_a_bus_that_goes_away_does_not_stop_the_drives(self):
         """Time passes for the nodes, and they are there again when the bus is."""
         running = RunningMachine(machine())
