@@ -152,6 +152,7 @@ class MotionWatch(Protocol):
         offset: Sequence[float],
         *,
         fresh: bool,
+        late: float,
     ) -> Alarm | None:
         """Take the sample of one SYNC; return why the motion has to end, or None.
 
@@ -163,6 +164,8 @@ class MotionWatch(Protocol):
             Position targets and torque offsets that took effect at it, as sent, M values each, SI.
         fresh
             Whether the SYNC was in time and every drive answered it; else a sample may be an old one.
+        late
+            Seconds by which the SYNC came later than a cycle after the one before; below 0: sooner.
         """
 
 

@@ -98,7 +98,7 @@ class Balance:
         way = abs(position - place) * self._position_unit
         work = (before + now) / 2 * (position - place) * self._position_unit
         jump = abs(now - before)
-        self._note_brakes(now, jump, abs(target - asked) * self._position_unit)
+        self._note_brakes(now, jump, abs(target - asked) * self._position_unit if enabled else 0.0)
         doubt = SCALE * abs(work) + jump * ROUNDING * self._position_unit
         doubt += max(
             jump * self._delay * way,

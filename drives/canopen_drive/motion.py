@@ -693,6 +693,7 @@ class CanopenMotion:
             [one * scale.position for one, scale in zip(targets, scales, strict=True)],
             [one * scale.torque for one, scale in zip(offsets, scales, strict=True)],
             fresh=self._complete,
+            late=self._sync.stretch,
         )
         if alarm is not None:
             raise OscillationError(

@@ -38,6 +38,8 @@ class Sync(Protocol):
     """Largest lateness, s."""
     lateness: float
     """Of the present cycle, s; 0 where it is not late."""
+    stretch: float
+    """Seconds by which the present SYNC came later than a cycle after the one before."""
     behind: list[int]
     """Of each cycle, in a row until the present one, whose SYNC went out before all earlier frames were
     taken: the identifier of the last one taken.  What comes next may be old."""
@@ -63,12 +65,14 @@ class HostSync:
         self._message = can.Message(arbitration_id=SYNC_ID, is_extended_id=False)
         self._start, self._count = line.clock.now() + cycle_time, 0
         self.cycles = self.late = 0
-        self.worst = self.lateness = 0.0
+        self.worst = self.lateness = self.stretch = 0.0
+        self._last: float | None = None
         self.behind: list[int] = []
 
     def restart(self) -> None:
         """Begin anew: the next cycle is one cycle time from now."""
         self._start, self._count = self._line.clock.now() + self._cycle_time, 0
+        self._last = None
 
     def give(self, early: Early) -> float:
         """Wait for the next cycle's moment, take what came until then, and send a SYNC.
@@ -87,6 +91,7 @@ class HostSync:
             moment += late
         held_up = 0.0 if self.behind else max(0.0, late)
         self._take_early(early, clock.now() + held_up + self._cycle_time)
+        self._note_stretch(clock.now())
         line.send(self._message)
         return moment
 
@@ -108,6 +113,10 @@ class HostSync:
         self.lateness = late if late > LATE_SHARE * self._cycle_time else 0.0
         self.late += self.lateness > 0
 
+    def _note_stretch(self, moment: float) -> None:
+        self.stretch = 0.0 if self._last is None else moment - self._last - self._cycle_time
+        self._last = moment
+
 
 class KernelSync(HostSync):
     """The kernel's broadcast manager sends it, on a lease that every cycle renews.
@@ -128,6 +137,7 @@ class KernelSync(HostSync):
         if self._origin is not None:
             self._lease.stop()
         self._origin, self._count, self._period = None, 0, self._cycle_time
+        self._last = None
 
     def give(self, early: Early) -> float:
         """Renew the lease, and wait for the SYNC that acts on the targets just sent.
@@ -187,6 +197,7 @@ class KernelSync(HostSync):
         most = MOST_PULL * self._cycle_time
         self._period = self._cycle_time - min(most, max(-most, PULL * phase))
         self._note(max(overtaken, phase))
+        self._note_stretch(moment)
 
     def close(self) -> None:
         """Send none any more."""

@@ -94,6 +94,12 @@ class Servo:
         x = self.timing.cycle * s
         return np.where(np.abs(x) < 1e-6, 1.0, -np.expm1(-x) / np.where(x == 0, 1.0, x))
 
+    @property
+    def fed(self) -> tuple[float, float]:
+        """Torque per velocity, and per acceleration, of a reference that is followed."""
+        loop = self.loop
+        return loop.velocity_ff * loop.velocity_p + loop.viscous_ff, loop.inertia_ff
+
     def target_noise(self, resolution: float) -> float:
         """Return the RMS of the torque that the steps of cyclic targets make while they move, N m or N.
 
@@ -107,12 +113,12 @@ class Servo:
         resolution
             One step of the targets, rad or m.
         """
-        cycle, loop = self.timing.cycle, self.loop
+        cycle = self.timing.cycle
         if cycle <= 0:
             return 0.0
-        per_velocity = loop.velocity_ff * loop.velocity_p + loop.viscous_ff
+        per_velocity, per_acceleration = self.fed
         velocity = np.sqrt(2.0) / cycle * per_velocity
-        acceleration = np.sqrt(6.0) / cycle**2 * loop.inertia_ff
+        acceleration = np.sqrt(6.0) / cycle**2 * per_acceleration
         return float(resolution / np.sqrt(12) * np.hypot(velocity, acceleration))
 
     def torque_noise(self, resolution: float) -> float:

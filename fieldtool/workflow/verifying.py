@@ -288,6 +288,7 @@ class Verification:
             trusts_loops=trusts_loops,
             louder=self._louder(servos),
             steps=np.array([torque_steps(drive, servo, cycle) for drive, servo in pairs]),
+            fed=np.array([servo.fed for servo in servos]).T,
             sags=None if self._old is None else self._old.sags,
             guards=self._guards.of(servos, self._old),
             report=self._session.screen.progress,

@@ -1,16 +1,21 @@
 """SYNCs that come a little late: drives have their reference at rest by then, and torques show it."""
 
+from dataclasses import replace
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 import pytest
 
 from drives.canopen_drive import connect
+from drives.canopen_drive.sync import HostSync
 from drives.errors import SafetyStopError
 from drives.profile import load_machine
 from drives.sim.faults import MotorReversed
 from drives.sim.lockstep_bus import register, unregister
 from drives.sim.machine import simulated_machine
+from fieldtool.experiment.verification.trial import run_trial
+from tests.session.test_trial import Gains, axes_of, move, trial
 
 MACHINE = Path(__file__).parents[1] / "socketcan" / "machine.yaml"
 CHANNEL = "late-sync"
@@ -90,3 +95,57 @@ def test_and_hide_none(machine, fresh_rng, cycle):
         finally:
             taken = running.now - begun[0]
     assert taken < 0.7  # up to 0.3 s of targets were on their way to the drives before
+
+
+STEP = 0.01
+FED = np.array([[40.0, 80.0], [0.0, 0.0]])
+"""What the loops of the machine feed forward."""
+
+
+def late_by(rng, mean):
+    """Have one SYNC in three come late by this mean time, s, and those after it in time again."""
+    give = HostSync.give
+
+    def given(sync, early):
+        if rng.random() < 0.3:
+            clock, late = sync._line.clock, min(rng.exponential(mean), 0.2 * STEP)
+            clock.wait_until(clock.now() + late)
+            sync._start += late
+        return give(sync, early)
+
+    return patch.object(HostSync, "give", given)
+
+
+def slow_trial():
+    """Each axis by 0.5 rad out and back, at up to 1.2 rad/s."""
+    with patch("tests.session.test_trial.STEP", STEP):
+        moves = (move(0, 0.5, 0.8, [60.0, 60.0]), move(1, -0.5, 0.8, [40.0, 160.0]))
+    return replace(trial(), cycle_time=STEP, moves=moves)
+
+
+def try_late(machine, rng, fed, before=lambda _: None):
+    running = register(CHANNEL, simulated_machine(machine))
+    kept = []
+    with connect(machine) as group, late_by(rng, 0.06 * STEP):
+        before(running)
+        run_trial(
+            group, slow_trial(), axes_of(group), kept.append, "before", trusts_loops=True, fed=fed
+        )
+    return kept
+
+
+def test_a_trial_stands_late_syncs(machine, fresh_rng):
+    kept = try_late(machine, fresh_rng, FED)
+    assert [e.name for e in kept] == ["before: move of table", "before: move of arm"]
+
+
+def test_it_would_not_without_leaving_out_what_drives_do_then(machine, fresh_rng):
+    """What the test above is worth."""
+    with pytest.raises(SafetyStopError, match="oscillates at about"):
+        try_late(machine, fresh_rng, None)
+
+
+def test_late_syncs_hide_no_loop_that_swings(machine, fresh_rng):
+    node = int(fresh_rng.choice([11, 12]))
+    with pytest.raises(SafetyStopError, match=r"oscillates|runs away or swings|its torque went"):
+        try_late(machine, fresh_rng, FED, lambda running: running.inject(Gains(node, factor=25.0)))

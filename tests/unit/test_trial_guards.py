@@ -46,7 +46,7 @@ class Blind:
     def begin(self):
         """Nothing is kept."""
 
-    def take(self, position, torque):
+    def take(self, position, torque, smooth):
         """Say nothing."""
 
 
@@ -657,7 +657,7 @@ def test_a_lost_sample_ends_what_is_reckoned_of_work():
     guarded = TrialWatch(["x"], Blind(), Guards(watch(GOOD), work))
     guarded.begin()
     for n in range(200):
-        guarded.take([n * COUNT], [-5.0], [0.0], [0.0], fresh=n % 20 != 19)
+        guarded.take([n * COUNT], [-5.0], [0.0], [0.0], fresh=n % 20 != 19, late=0.0)
         assert n % 20 != 19 or work.missing == 0.0
 
 

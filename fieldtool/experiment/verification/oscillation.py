@@ -313,17 +313,26 @@ class OscillationWatch:
         for position, level in zip(self._positions, allowed.position_swing.tolist(), strict=True):
             position.go_on(level)
 
-    def take(self, position: Sequence[float], torque: Sequence[float]) -> Alarm | None:
-        """Take one cycle; see ``drives.api.MotionWatch``."""
+    def take(
+        self,
+        position: Sequence[float],
+        torque: Sequence[float],
+        smooth: Sequence[float] | None = None,
+    ) -> Alarm | None:
+        """Take one cycle; see ``drives.api.MotionWatch``.
+
+        ``smooth`` are the torques whose swings count, where those that were measured show more.
+        """
         if self._allowed is None:
             self.hold(np.array(position), enabling=True)
         allowed = self._allowed
         if allowed is None:
             raise AssertionError("something is always allowed")
+        swinging = torque if smooth is None else smooth
         found = [
             (k, text)
             for k in range(len(self._names))
-            if (text := self._judge(k, position[k], torque[k], allowed))
+            if (text := self._judge(k, position[k], torque[k], swinging[k], allowed))
         ]
         self._follow_rest(torque, allowed)
         self._listen(torque)
@@ -344,11 +353,13 @@ class OscillationWatch:
             share = min(1.0, self._step / REST_TIME)
             self._rest = [r + share * (t - r) for r, t in zip(self._rest, torque, strict=True)]
 
-    def _judge(self, k: int, position: float, torque: float, allowed: Allowed) -> str:
+    def _judge(
+        self, k: int, position: float, torque: float, swinging: float, allowed: Allowed
+    ) -> str:
         """Return what is wrong with an axis, in words; empty where nothing is."""
         if not (isfinite(position) and isfinite(torque)):
             return f"its position is told as {position:g} and its torque as {torque:g}: no numbers"
-        turned = self._torques[k].take(torque)
+        turned = self._torques[k].take(swinging)
         swung = self._positions[k].take(position)
         unit, torque_unit = self._units[k]
         if not allowed.low[k] <= position <= allowed.high[k]:

@@ -23,6 +23,7 @@ from fieldtool.experiment.axes import (
 from fieldtool.experiment.directions import CHECK_ASTRAY, CHECK_ASTRAY_ERROR, CHECK_COUNTS
 from fieldtool.experiment.multisine.plan import MultisinePlan
 from fieldtool.experiment.multisine.runner import Report, run_multisine
+from fieldtool.experiment.verification.brakes import Brakes
 from fieldtool.experiment.verification.mover import HOLD_TIME, ExcitedMover, WatchedMover
 from fieldtool.experiment.verification.oscillation import OscillationWatch
 from fieldtool.experiment.verification.steps import (
@@ -112,6 +113,7 @@ def run_trial(
     trusts_loops: bool,
     louder: FloatArray | None = None,
     steps: FloatArray | None = None,
+    fed: FloatArray | None = None,
     sags: FloatArray | None = None,
     guards: Guards = NOBODY,
     report: Report = lambda _: None,
@@ -133,6 +135,8 @@ def run_trial(
         Whose loops are tried, for the experiments' names: ``before``, ``after``.
     trusts_loops, louder, steps
         See :class:`OscillationWatch`.
+    fed
+        Torque per velocity and per acceleration that loops feed forward, shape (2, M), SI.
     sags
         How far axes were seen to sag under other loops as they were enabled, shape (M,), rad or m.
     guards
@@ -163,7 +167,8 @@ def run_trial(
         steps=steps,
         units=axes.units,
     )
-    watch = TrialWatch(axes.names, swings, guards)
+    brakes = None if fed is None else Brakes(fed, trial.cycle_time)
+    watch = TrialWatch(axes.names, swings, guards, brakes)
     rests: list[Capture] = []
     kept: list[Experiment] = []
 

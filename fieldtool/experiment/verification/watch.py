@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from drives.api import Alarm, FloatArray
+from fieldtool.experiment.verification.brakes import Brakes
 from fieldtool.experiment.verification.identity import IdentityWatch
 from fieldtool.experiment.verification.oscillation import OscillationWatch
 from fieldtool.experiment.verification.work import WorkRecord, WorkWatch
@@ -22,10 +23,20 @@ class Guards:
 
 
 class TrialWatch:
-    """Lets each of the watches look at every cycle; a ``drives.api.MotionWatch``."""
+    """Lets each of the watches look at every cycle; a ``drives.api.MotionWatch``.
 
-    def __init__(self, names: Sequence[str], swings: OscillationWatch, guards: Guards) -> None:
+    ``brakes`` leaves out of the torques that may swing what drives do at late SYNCs; None: nobody does.
+    """
+
+    def __init__(
+        self,
+        names: Sequence[str],
+        swings: OscillationWatch,
+        guards: Guards,
+        brakes: Brakes | None = None,
+    ) -> None:
         self._names, self.swings, self._guards = tuple(names), swings, guards
+        self._brakes = brakes
         self._small = True
         self.most_late = np.inf
         """Seconds by which the present cycle may begin late where targets move."""
@@ -38,6 +49,8 @@ class TrialWatch:
     def begin(self) -> None:
         """Another motion begins: its axes stand still where they are first seen."""
         self.swings.begin()
+        if self._brakes is not None:
+            self._brakes.begin()
         self._small = True
         if self._guards.identity is not None:
             self._guards.identity.begin()
@@ -72,9 +85,11 @@ class TrialWatch:
         offset: Sequence[float],
         *,
         fresh: bool,
+        late: float,
     ) -> Alarm | None:
         """Take one cycle; see ``drives.api.MotionWatch``."""
-        alarm = self.swings.take(position, torque)
+        smooth = torque if self._brakes is None else self._brakes.take(torque, target, late)
+        alarm = self.swings.take(position, torque, smooth)
         if alarm is not None:
             return alarm
         found: list[tuple[int, str]] = []
