@@ -19,6 +19,9 @@ class AxisLimits:
     acceleration: float
     torque: float
     following_error: float
+    sag: float | None = None
+    """How far it may sink when its drive is enabled and its brake opens; None: no farther than any
+    axis that stands."""
 
 
 @dataclass(frozen=True)

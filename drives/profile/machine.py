@@ -23,8 +23,13 @@ from drives.profile.values import (
 from drives.units import Kind, parse_quantity
 
 
+SAG_SHARE = 0.01
+"""Share of its travel that an axis may be allowed to sag, at most."""
+
+
 class Limits(Part):
-    """What an axis may do during experiments, SI.  All are mandatory: no limit known, no motion."""
+    """What an axis may do during experiments, SI.  No limit known, no motion: all but the last are
+    mandatory."""
 
     travel: tuple[Number, Number]
     """Lowest and highest position, rad or m."""
@@ -32,6 +37,9 @@ class Limits(Part):
     acceleration: Positive
     torque: Positive
     following_error: Positive
+    sag: Positive | None = None
+    """How far a weight may pull the axis when its drive is enabled and its brake opens, until its loop
+    holds it, rad or m; none: it has to stand still then, too."""
 
     @property
     def watched(self) -> AxisLimits:
@@ -142,6 +150,7 @@ class AxisProfile(Part):
             "acceleration": dimension["acceleration"],
             "torque": dimension["torque"],
             "following_error": dimension["position"],
+            "sag": dimension["position"],
         }
         limits = dict(data["limits"])
         for key, quantity in of_key.items():
@@ -168,6 +177,7 @@ class AxisProfile(Part):
                 f"must go from low to high, got {low:.4g} {unit} to {high:.4g} {unit}: write the lower "
                 "position first",
             )
+        self._check_sag(high - low)
         move = self.typical_move
         if move is not None:
             for name, wanted, limit in (
@@ -181,6 +191,28 @@ class AxisProfile(Part):
                         f"{wanted:g} is more than the limits allow, {limit:g}",
                     )
         return self
+
+    def _check_sag(self, travel: float) -> None:
+        sag, unit = self.limits.sag, "rad" if self.kind == "rotary" else "m"
+        if sag is None:
+            return
+        if self.may_float:
+            raise LocatedError(
+                ("limits", "sag"),
+                "an axis that may float (`may_float: true`) has no weight that pulls it down: remove "
+                "`sag`, or `may_float` if it has one",
+            )
+        error = self.limits.following_error
+        for most, what in (
+            (SAG_SHARE * travel, f"{100 * SAG_SHARE:g} % of the travel"),
+            (error, "the following error limit"),
+        ):
+            if sag > most:
+                raise LocatedError(
+                    ("limits", "sag"),
+                    f"{sag:.4g} {unit} is more than {most:.4g} {unit}, {what}: for an axis that sags so "
+                    "far raise the gains velocity_i and position_p in its drive",
+                )
 
 
 class MachineProfile(Part):

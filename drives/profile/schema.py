@@ -24,6 +24,7 @@ _QUANTITIES: dict[str, dict[str, Any]] = {
             "acceleration": ["60 rad/s2", "5 m/s2"],
             "torque": ["12 N m", "200 N"],
             "following_error": ["5 deg", "2 mm"],
+            "sag": ["0.2 deg", "0.5 mm"],
         }.items()
     },
 }

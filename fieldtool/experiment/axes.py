@@ -7,7 +7,7 @@ from typing import Protocol
 
 import numpy as np
 
-from drives.api import AxisLimits, Capture, FloatArray, Motion, MotionWatch
+from drives.api import AxisLimits, Capture, FloatArray, Motion, MotionWatch, Source
 from drives.canopen_drive.interrupts import uninterrupted
 from fieldtool.experiment.stepped.plan import smooth_move
 from fieldtool.records.recording import Experiment
@@ -72,6 +72,11 @@ class Axes:
         return self.units[k] if self.units else ""
 
     @property
+    def sags(self) -> FloatArray:
+        """How far each axis may sink as it is enabled, shape (M,), rad or m; 0 where none is given."""
+        return np.array([one.sag or 0.0 for one in self.limits])
+
+    @property
     def room(self) -> FloatArray:
         """From the centre to the nearer end of the travel, shape (M,)."""
         return np.array(
@@ -125,6 +130,71 @@ def positioning_move(axes: Axes, k: int, distance: float, step: float) -> FloatA
     return smooth_move(
         distance, MOVE_SHARE * limits.velocity, MOVE_SHARE * limits.acceleration, step
     )
+
+
+def sag_words(sag: float | None, unit: str) -> str:
+    """Say what to do about an axis that moved as it was enabled, and may have sagged."""
+    if sag is None:
+        return (
+            "Hold it and look before you enable it again: only if a weight pulls it down and its loop "
+            "then holds it, write how far as `sag` into its limits in the machine profile, or raise "
+            "velocity_i and position_p."
+        )
+    return (
+        f"Its `sag` in the machine profile is {sag:.3g} {unit}, while drives are enabled only: if it "
+        "sags farther, raise velocity_i and position_p."
+    )
+
+
+class Standstill:
+    """Tells whether axes have stood for STILL_TIME, wherever that is, or STILL_TIMEOUT is up.
+
+    Parameters
+    ----------
+    at
+        Where they are now, shape (M,), rad or m.
+    quiet
+        From where each was it may go less than this while it stands, shape (M,).
+    step
+        Seconds from SYNC to SYNC.
+    """
+
+    def __init__(self, at: FloatArray, quiet: FloatArray, step: float) -> None:
+        self._mark, self._quiet = at, quiet
+        self._waited = self._still = 0
+        self._rows, self._most = round(STILL_TIME / step), round(STILL_TIMEOUT / step)
+
+    def take(self, at: FloatArray, rows: int) -> bool:
+        """Take where they are, shape (M,), so many cycles later; return whether the wait is over."""
+        self._waited += rows
+        self._still += rows
+        if np.any(np.abs(at - self._mark) >= self._quiet):
+            self._mark, self._still = at, 0
+        return self._still >= self._rows or self._waited >= self._most
+
+
+def until_still(
+    motion: Motion,
+    targets: FloatArray,
+    quiet: FloatArray,
+    rows: int,
+    judge: Callable[[FloatArray], None] = lambda _: None,
+) -> Source:
+    """Return a source that holds all axes at their targets, shape (M,), until those that sag stand.
+
+    ``quiet`` as for :class:`Standstill`; ``judge`` is given where all axes are, shape (M,), every so
+    many cycles, and raises if one goes astray.
+    """
+    standstill = Standstill(motion.position, quiet, motion.cycle_time)
+
+    def source(before: Capture | None) -> FloatArray | None:
+        if before is not None:
+            judge(before.position[-1])
+            if standstill.take(before.position[-1], rows):
+                return None
+        return np.tile(targets, (rows, 1))
+
+    return source
 
 
 def sample_times(rows: int, step: float) -> FloatArray:

@@ -10,13 +10,15 @@ from fieldtool.errors import PlanRefusedError
 from fieldtool.experiment.axes import (
     MOVE_SHARE,
     STILL_TIME,
-    STILL_TIMEOUT,
     Axes,
     Keep,
     Mover,
+    Standstill,
     keep_all,
     keep_whatever_happens,
+    sag_words,
     sample_times,
+    until_still,
 )
 from fieldtool.experiment.plausible import (
     BLIND_SPEED,
@@ -80,7 +82,7 @@ def check_directions(group: Mover, axes: Axes, cycle_time: float, keep: Keep) ->
     push, its own or another axis', and the nudges find that while it is slow.  Each move is judged
     from where the axes stand when it begins: friction may have held one beside its target, but not
     farther from its very first start than its own nudge (in the moves after the nudges: than it may
-    be pushed).
+    be pushed).  An axis whose limits say how far it may sag is first given the time to do so.
 
     Raises
     ------
@@ -95,11 +97,14 @@ def check_directions(group: Mover, axes: Axes, cycle_time: float, keep: Keep) ->
     try:
         with _enabled(group, axes, cycle_time) as motion:
             start = motion.position
-            proven = _prove(motion, axes, start, experiments.append)
+            sunk = _let_sink(motion, axes, start, experiments.append)
+            proven = _prove(motion, axes, start, sunk, experiments.append)
             experiments.clear()  # of these, too, only one that was cut short is worth keeping
             for k in range(len(axes.names)):
                 stands = motion.position
-                nudge = _DirectionCheck(axes, k, start, stands, cycle_time, proven[k], nudge=True)
+                nudge = _DirectionCheck(
+                    axes, k, start, stands, cycle_time, proven[k], sunk, nudge=True
+                )
                 _stream_check(
                     motion,
                     nudge,
@@ -109,7 +114,8 @@ def check_directions(group: Mover, axes: Axes, cycle_time: float, keep: Keep) ->
                 )
             experiments.clear()  # of the nudges only one that was cut short is worth keeping
             for k in range(len(axes.names)):
-                check = _DirectionCheck(axes, k, start, motion.position, cycle_time, proven[k])
+                stands = motion.position
+                check = _DirectionCheck(axes, k, start, stands, cycle_time, proven[k], sunk)
                 capture = _stream_check(
                     motion,
                     check,
@@ -130,7 +136,25 @@ def _enabled(group: Mover, axes: Axes, cycle_time: float) -> AbstractContextMana
     return group.motion(cycle_time)
 
 
-def _prove(motion: Motion, axes: Axes, start: FloatArray, keep: Keep) -> tuple[bool, ...]:
+def _let_sink(motion: Motion, axes: Axes, start: FloatArray, keep: Keep) -> FloatArray:
+    """Wait until axes that sag stand; return how far from their start they are then, shape (M,)."""
+    sags = axes.sags
+    if not np.any(sags):
+        return np.zeros_like(start)
+    allowed = _astray(axes) + CHECK_COUNTS * axes.counts
+
+    def judge(position: FloatArray) -> None:
+        for k in range(sags.size):
+            _stay(axes, k, float(position[k] - start[k]), 0.0, float(allowed[k] + sags[k]))
+
+    source = until_still(motion, start, CHECK_QUIET * allowed, CHECK_SLICE, judge)
+    _stream_check(motion, source, "standing still", "", keep)
+    return np.where(sags > 0, motion.position - start, 0.0)
+
+
+def _prove(
+    motion: Motion, axes: Axes, start: FloatArray, sunk: FloatArray, keep: Keep
+) -> tuple[bool, ...]:
     """See that every encoder counts; return of which it is sure."""
     allowed = _astray(axes) + CHECK_COUNTS * axes.counts
     quiet = np.maximum(PROOF_SHOWN * axes.counts, PROOF_QUIET * allowed)
@@ -140,14 +164,14 @@ def _prove(motion: Motion, axes: Axes, start: FloatArray, keep: Keep) -> tuple[b
 
         def judge(position: FloatArray, way: float, k: int = k) -> None:
             ways[k] = max(ways[k], way)
-            for j, other in enumerate(axes.names):
+            for j in range(ways.size):
                 most = float(allowed[j]) + PUSHED_WAY * float(ways[units == units[j]].max())
                 if (
                     j != k
                 ):  # another's pulses may shake it as far as another's move, or its own pulses
                     own = float(allowed[j]) + PUSHED_WAY * float(ways[j])
                     most = min(most, max(CHECK_PUSHED * float(allowed[j]), own))
-                _DirectionCheck.stay(other, float(position[j] - start[j]), 0.0, most, axes.unit(j))
+                _stay(axes, j, float(position[j] - start[j]), float(sunk[j]), most)
 
         proof = Proof(axes, k, start, motion.cycle_time, quiet, judge)
         if proof.asks:
@@ -214,6 +238,7 @@ class _DirectionCheck:
         stands: FloatArray,
         cycle_time: float,
         proven: bool,
+        sunk: FloatArray,
         nudge: bool = False,
     ) -> None:
         self._axes, self._k, self._start, self._nudge = axes, k, start, nudge
@@ -226,7 +251,8 @@ class _DirectionCheck:
         self._allowed = astray + self._slack
         most = np.minimum(CHECK_NUDGE_COUNTS * axes.counts, CHECK_NUDGE_MOST * sizes)
         nudges = np.maximum(CHECK_NUDGE * sizes, most)
-        self._reach = nudges if nudge else np.maximum(nudges, CHECK_PUSHED * astray)
+        reach = nudges if nudge else np.maximum(nudges, CHECK_PUSHED * astray)
+        self._reach = np.minimum(-reach, sunk), np.maximum(reach, sunk)
         self._begin_at(stands)
         self._wanted = float(np.copysign(sizes[k], axes.centre[k] - start[k]))
         self._rest = max(2, round(CHECK_REST / cycle_time))
@@ -244,11 +270,10 @@ class _DirectionCheck:
             share = float(nudges[k] / sizes[k])
             self._path, self._wanted = share * self._path, share * self._wanted
         self._done = 0
-        self._mark = stands - start
+        self._standstill = Standstill(stands - start, CHECK_QUIET * self._allowed, cycle_time)
         self._waiting = k > 0 or not nudge
-        self._waited = self._still = 0
+        self._waited = 0
         self._still_rows = round(STILL_TIME / cycle_time)
-        self._longest_wait = round(STILL_TIMEOUT / cycle_time)
         self._cycle_time = cycle_time
         self._blind: BlindPush | None = None
         self._resting: list[float] = []
@@ -271,7 +296,7 @@ class _DirectionCheck:
 
     def _begin_at(self, stands: FloatArray) -> None:
         """Judge from here, as distances from the very first start, and never from beyond reach."""
-        self._offset = np.clip(stands - self._start, -self._reach, self._reach)
+        self._offset = np.clip(stands - self._start, *self._reach)
 
     def _watch(self, capture: Capture) -> None:
         self._watch_torque(capture)
@@ -283,7 +308,7 @@ class _DirectionCheck:
                 self._follow(name, float(moved[j]), float(self._offset[j]), allowed)
             else:
                 most = allowed * (CHECK_PUSHED if pushed else 1.0)
-                self.stay(name, float(moved[j]), float(self._offset[j]), most, self._axes.unit(j))
+                _stay(self._axes, j, float(moved[j]), float(self._offset[j]), most)
         if self._waiting:
             self._wait(moved)
 
@@ -324,25 +349,9 @@ class _DirectionCheck:
 
     def _wait(self, moved: FloatArray) -> None:
         """End the wait when all axes have stood for long enough, wherever that is."""
-        self._still += CHECK_SLICE
-        if np.any(np.abs(moved - self._mark) >= CHECK_QUIET * self._allowed):
-            self._mark, self._still = moved, 0
-        if self._still >= self._still_rows or self._waited >= self._longest_wait:
+        if self._standstill.take(moved, CHECK_SLICE):
             self._waiting = False
             self._begin_at(self._start + moved)
-
-    @staticmethod
-    def stay(name: str, moved: float, offset: float, allowed: float, unit: str) -> None:
-        """Raise if it left where it stood; back to its first start, where its target is, it may go."""
-        if not min(0.0, offset) - allowed <= moved <= max(0.0, offset) + allowed:
-            raise SafetyStopError(
-                f"{name}: moved by {moved - offset:.3g} {unit} while it was told to stand still; its "
-                "power was cut and all axes were stopped. Either the axis moves the wrong way (check "
-                "the encoder's direction and the motor's phases), or its loop is not stable, or it sags "
-                "when its brake opens.",
-                axis=name,
-                runaway=True,
-            )
 
     def _follow(self, name: str, moved: float, offset: float, allowed: float) -> None:
         sign, unit = float(np.sign(self._wanted)), self._axes.unit(self._k)
@@ -424,12 +433,26 @@ class _DirectionCheck:
             )
 
 
+def _stay(axes: Axes, k: int, moved: float, offset: float, allowed: float) -> None:
+    """Raise if it left where it stood; back to its first start, where its target is, it may go."""
+    if not min(0.0, offset) - allowed <= moved <= max(0.0, offset) + allowed:
+        name, unit, sag = axes.names[k], axes.unit(k), axes.limits[k].sag
+        raise SafetyStopError(
+            f"{name}: moved by {moved - offset:.3g} {unit} while it was told to stand still; its "
+            "power was cut and all axes were stopped. Either the axis moves the wrong way (check "
+            "the encoder's direction and the motor's phases), or its loop is not stable, or it sags "
+            f"when its brake opens. {sag_words(sag, unit)}",
+            axis=name,
+            runaway=True,
+        )
+
+
 def _stream_check(motion: Motion, check: Source, name: str, driven: str, keep: Keep) -> Capture:
     def experiment(capture: Capture, note: str = "") -> Experiment:
         return Experiment(
             name=name.format(driven),
             kind="moves",
-            driven=(driven,),
+            driven=(driven,) if driven else (),
             free=(),
             period=None,
             time=sample_times(capture.rows, motion.cycle_time),
