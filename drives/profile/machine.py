@@ -22,14 +22,14 @@ from drives.profile.values import (
 )
 from drives.units import Kind, parse_quantity
 
-
 SAG_SHARE = 0.01
 """Share of its travel that an axis may be allowed to sag, at most."""
 
 
 class Limits(Part):
-    """What an axis may do during experiments, SI.  No limit known, no motion: all but the last are
-    mandatory."""
+    """What an axis may do during experiments, SI.  No limit known, no motion: all are mandatory but
+    ``sag``.
+    """
 
     travel: tuple[Number, Number]
     """Lowest and highest position, rad or m."""

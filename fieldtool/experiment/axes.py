@@ -136,13 +136,13 @@ def sag_words(sag: float | None, unit: str) -> str:
     """Say what to do about an axis that moved as it was enabled, and may have sagged."""
     if sag is None:
         return (
-            "Hold it and look before you enable it again: only if a weight pulls it down and its loop "
-            "then holds it, write how far as `sag` into its limits in the machine profile, or raise "
-            "velocity_i and position_p."
+            "Secure it against falling and look before you enable it again. Only if its weight pulls "
+            "it down a little and its loop then holds it: raise its gains velocity_i and position_p, or "
+            "write how far it may sink as `sag` into its limits in the machine profile."
         )
     return (
-        f"Its `sag` in the machine profile is {sag:.3g} {unit}, while drives are enabled only: if it "
-        "sags farther, raise velocity_i and position_p."
+        f"Its limit `sag` in the machine profile is {sag:.3g} {unit}, which counts only while drives "
+        "are being enabled: if it sags farther, raise its gains velocity_i and position_p."
     )
 
 

@@ -161,7 +161,8 @@ class Verification:
                     "anything was written; nothing was. If the axis swings, lower its gains by hand "
                     "(velocity_i, then position_p and velocity_p); if it sags as it is enabled, or "
                     "another one pushes it away, raise velocity_i and position_p. Then measure and "
-                    "design anew: `fieldtool run`."
+                    "design anew: `fieldtool run`. If you have seen that it only sags by its weight, "
+                    "`sag` in its limits in the machine profile may say how far."
                 )
                 if note := other_than_first(held):
                     error.add_note(note)

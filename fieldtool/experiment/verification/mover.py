@@ -5,9 +5,9 @@ from contextlib import contextmanager
 
 import numpy as np
 
-from drives.api import Capture, FloatArray, Motion, MotionWatch
+from drives.api import Capture, FloatArray, Motion, MotionWatch, Source
 from drives.errors import StoppedError
-from fieldtool.experiment.axes import Mover
+from fieldtool.experiment.axes import Mover, until_still
 from fieldtool.experiment.verification.slices import slices
 from fieldtool.experiment.verification.watch import TrialWatch
 
@@ -20,7 +20,11 @@ RISE_TIME = 0.5
 
 
 class WatchedMover:
-    """Gives enabled axes that were seen to stand still first, with a watch that looks at every cycle."""
+    """Gives enabled axes that were seen to stand still first, with a watch that looks at every cycle.
+
+    Axes that may sag are given the time to do so; ``sags`` is how far, shape (M,), and within ``quiet``
+    they stand.
+    """
 
     def __init__(
         self,
@@ -28,11 +32,16 @@ class WatchedMover:
         watch: TrialWatch,
         rests: list[Capture],
         cut_off: Callable[[Capture, str], None],
+        sags: FloatArray,
+        quiet: FloatArray,
     ) -> None:
+        self._sags, self._quiet = sags, quiet
         self._group, self._watch, self._rests, self._cut_off = group, watch, rests, cut_off
         self.held = np.zeros(0)
         """Targets at which the axes of the motion were seen to stand, shape (M,): going on from there is
         no jolt, which it would be from where they are."""
+        self.sinks: list[Capture] = []
+        """What axes did before that as they were enabled, where some may sag."""
 
     @contextmanager
     def motion(
@@ -50,16 +59,26 @@ class WatchedMover:
             start = motion.position
             self._watch.hold(start, enabling=True)
             self.held = start
-            self.follow(motion, np.tile(start, (max(2, round(ENABLED_TIME / cycle_time)), 1)))
-            self._watch.hold(start)
+            rows = max(2, round(ENABLED_TIME / cycle_time))
+            enabled = self.follow(motion, np.tile(start, (rows, 1)))
+            stands = start
+            if np.any(self._sags > 0):
+                self._watch.hold(start, sinking=True)
+                sinks = until_still(motion, start, self._quiet, rows)
+                self.sinks += [enabled, self._stream(motion, sinks)]
+                stands = np.where(self._sags > 0, motion.position, start)
+            self._watch.hold(start, stands)
             still = np.tile(start, (max(2, round(HOLD_TIME / cycle_time)), 1))
             self._rests.append(self.follow(motion, still))
             yield motion
 
     def follow(self, motion: Motion, targets: FloatArray) -> Capture:
         """Follow targets, shape (n, M); what was captured of it is kept if it is stopped."""
+        return self._stream(motion, slices(targets, motion.cycle_time))
+
+    def _stream(self, motion: Motion, source: Source) -> Capture:
         try:
-            return motion.stream(slices(targets, motion.cycle_time))
+            return motion.stream(source)
         except StoppedError as error:
             if isinstance(error.capture, Capture) and error.capture.rows > 1:
                 self._cut_off(error.capture, str(error))

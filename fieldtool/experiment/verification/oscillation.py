@@ -123,6 +123,8 @@ class OscillationWatch:
         By how much torques may swing because targets that move are whole counts, peak to peak, (M,).
     units
         Of positions, one an axis, for messages.
+    sags
+        How much farther axes may go as they are enabled, shape (M,), rad or m; None: none.
     """
 
     def __init__(
@@ -137,12 +139,16 @@ class OscillationWatch:
         louder: FloatArray | None = None,
         steps: FloatArray | None = None,
         units: Sequence[str] = (),
+        sags: FloatArray | None = None,
     ) -> None:
         self._names, self._step, self._still = tuple(names), step, still
         self._units = [(unit, TORQUE_UNITS.get(unit, "")) for unit in units or [""] * len(names)]
         self._torque_limits = torque_limits(limits)
         errors = np.array([one.following_error for one in limits])
         self._position_swing = SWING_OF_ERROR * errors + SWING_COUNTS * counts
+        self._given = [one.sag for one in limits]
+        self._sags = np.zeros(len(self._names)) if sags is None else sags
+        self._first: FloatArray | None = None
         self._louder = np.ones(len(self._names)) if louder is None else louder
         self._steps = np.zeros(len(self._names)) if steps is None else steps
         self._trusts_loops = trusts_loops
@@ -162,7 +168,7 @@ class OscillationWatch:
 
     def begin(self) -> None:
         """Another motion begins: its axes stand still where they are first seen."""
-        self._allowed, self._rest = None, []
+        self._allowed, self._rest, self._first = None, [], None
         for swings in (*self._torques, *self._positions):
             swings.restart(float("inf"))
 
@@ -184,20 +190,32 @@ class OscillationWatch:
         level = self._louder * HOLD_LEVEL * self._torque_limits
         self._allow(replace(self._allowed, torque_swing=level))
 
-    def hold(self, at: FloatArray, *, enabling: bool = False) -> None:
-        """Allow no more than standing still at positions, shape (M,).
+    def hold(
+        self,
+        at: FloatArray,
+        stands: FloatArray | None = None,
+        *,
+        enabling: bool = False,
+        sinking: bool = False,
+    ) -> None:
+        """Allow no more than standing still at positions, shape (M,), or from there to where axes stand.
 
-        While drives are being enabled their targets follow their positions: by steps.
+        While drives are being enabled their targets follow their positions: by steps.  Until that is
+        over, and while they are ``sinking``, axes may sag from where they were first seen.
         """
         level = self._resting_louder * HOLD_LEVEL * self._torque_limits
         if enabling:
             steps = np.minimum(ENABLING * self._steps, MOST_STEPS * self._torque_limits)
             level = np.maximum(level, steps)
         still = (SAGS if self._trusts_loops else 1.0) * self._still
+        ends = [at, at if stands is None else stands]
+        if enabling or sinking:
+            first = at if self._first is None else self._first
+            ends += [np.where(self._sags > 0, first + way, at) for way in (-self._sags, self._sags)]
         self._allow(
             Allowed(
-                at - still,
-                at + still,
+                np.min(ends, axis=0) - still,
+                np.max(ends, axis=0) + still,
                 self._torque_limits,
                 level,
                 self._position_swing / 2,
@@ -324,7 +342,8 @@ class OscillationWatch:
         ``smooth`` are the torques whose swings count, where those that were measured show more.
         """
         if self._allowed is None:
-            self.hold(np.array(position), enabling=True)
+            self._first = np.array(position)
+            self.hold(self._first, enabling=True)
         allowed = self._allowed
         if allowed is None:
             raise AssertionError("something is always allowed")
@@ -353,6 +372,12 @@ class OscillationWatch:
             share = min(1.0, self._step / REST_TIME)
             self._rest = [r + share * (t - r) for r, t in zip(self._rest, torque, strict=True)]
 
+    def _sag_words(self, k: int) -> str:
+        sag = self._given[k]
+        if sag is None:
+            return "its limits in the machine profile have no `sag`"
+        return f"its limit `sag` is {sag:.3g} {self._units[k][0]} while drives are being enabled"
+
     def _judge(
         self, k: int, position: float, torque: float, swinging: float, allowed: Allowed
     ) -> str:
@@ -364,7 +389,7 @@ class OscillationWatch:
         unit, torque_unit = self._units[k]
         if not allowed.low[k] <= position <= allowed.high[k]:
             others = allowed.moving not in (None, k)
-            sags = ", or it sags under its load" if allowed.resting else ""
+            sags = f", or it sags under its load ({self._sag_words(k)})" if allowed.resting else ""
             sags += ", or the axis that moves pushes it away" if others else ""
             return (
                 f"is at {position:.5g} {unit}, outside of {allowed.low[k]:.5g} to "

@@ -20,12 +20,17 @@ from fieldtool.experiment.axes import (
     keep_all,
     keep_whatever_happens,
 )
-from fieldtool.experiment.directions import CHECK_ASTRAY, CHECK_ASTRAY_ERROR, CHECK_COUNTS
+from fieldtool.experiment.directions import (
+    CHECK_ASTRAY,
+    CHECK_ASTRAY_ERROR,
+    CHECK_COUNTS,
+    CHECK_QUIET,
+)
 from fieldtool.experiment.multisine.plan import MultisinePlan
 from fieldtool.experiment.multisine.runner import Report, run_multisine
 from fieldtool.experiment.verification.brakes import Brakes
 from fieldtool.experiment.verification.mover import HOLD_TIME, ExcitedMover, WatchedMover
-from fieldtool.experiment.verification.oscillation import OscillationWatch
+from fieldtool.experiment.verification.oscillation import SAGS, OscillationWatch
 from fieldtool.experiment.verification.steps import (
     NUDGE_TIME,
     PROBE_REST,
@@ -153,9 +158,12 @@ def run_trial(
     StoppedError
         If a limit was passed, a drive failed or the user stopped.
     """
-    still = still_allowed(axes)
+    still, may_sag = still_allowed(axes), axes.sags
+    quiet = CHECK_QUIET * still
     if sags is not None:
-        still = np.maximum(still, SAGGED * sags)
+        may_sag = np.minimum(may_sag, SAGGED * sags)
+        # what goes beyond that is `sag`, which counts only as drives are enabled
+        still = np.maximum(still, SAGGED * np.minimum(sags, SAGS * still))
     swings = OscillationWatch(
         axes.names,
         axes.limits,
@@ -166,6 +174,7 @@ def run_trial(
         louder=louder,
         steps=steps,
         units=axes.units,
+        sags=may_sag,
     )
     brakes = None if fed is None else Brakes(fed, trial.cycle_time)
     watch = TrialWatch(axes.names, swings, guards, brakes)
@@ -175,7 +184,7 @@ def run_trial(
     def cut_off(capture: Capture, why: str) -> None:
         kept.append(recorded(capture, (), f"{name}: standing still", trial.cycle_time, why))
 
-    mover = WatchedMover(group, watch, rests, cut_off)
+    mover = WatchedMover(group, watch, rests, cut_off, may_sag, quiet)
     try:
         with mover.motion(trial.cycle_time) as motion:
             start = mover.held
@@ -203,7 +212,8 @@ def run_trial(
     rest, earlier = last[-rows:].mean(axis=0), last[-2 * rows : -rows]
     others = [rests[-1].torque[rests[-1].rows // 2 :], *([earlier] if earlier.size else [])]
     unsure = np.max([np.abs(one.mean(axis=0) - rest) for one in others], axis=0)
-    sagged = np.abs(rests[0].position - rests[0].position_reference).max(axis=0)
+    seen = [*mover.sinks[:2], rests[0]]
+    sagged = np.max([np.abs(c.position - c.position_reference).max(axis=0) for c in seen], axis=0)
     return Tried(tuple(kept), noise, rest, unsure, sagged)
 
 

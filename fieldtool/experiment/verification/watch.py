@@ -57,9 +57,16 @@ class TrialWatch:
         if self._guards.work is not None:
             self._guards.work.begin()
 
-    def hold(self, at: FloatArray, *, enabling: bool = False) -> None:
-        """Allow no more than standing still at positions, shape (M,)."""
-        self.swings.hold(at, enabling=enabling)
+    def hold(
+        self,
+        at: FloatArray,
+        stands: FloatArray | None = None,
+        *,
+        enabling: bool = False,
+        sinking: bool = False,
+    ) -> None:
+        """Allow no more than standing still; see :meth:`OscillationWatch.hold`."""
+        self.swings.hold(at, stands, enabling=enabling, sinking=sinking)
         if self._guards.identity is not None:
             if enabling:
                 self._guards.identity.begin()  # references are known from the enabling on
