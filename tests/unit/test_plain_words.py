@@ -7,6 +7,7 @@ from drives.canopen_drive.group import profile_of
 from drives.errors import ProfileError
 from drives.profile import load_machine
 from drives.profile.plain_words import place_words, problem_words, unit_of
+from drives.units import parse_quantity
 
 GOOD = (
     "format: fieldtool-machine/1\nname: m\nbus: {interface: fieldsim, channel: x}\naxes:\n"
@@ -60,6 +61,16 @@ PROGRAMMERS = (
         ("springs: [190]", "springs: [stiff]", 17, "a number belongs here, in N m/rad, not 'stiff'"),
         ("bus: {", "bus: {bitrate: 500 kbit/s, ", 3, "number without a unit belongs here, in bit/s,"),
         ("name: table", "name: größe", 5, "axis größe, name: is a letter, then up to 31 letters"),
+        ("30 deg\n", "30 deg\n      sag: 0.01\n", 15, "axis table, limits.sag: 0.01 has no unit"),
+        ("30 deg\n", "30 deg\n      sag: 2 mm\n", 15, "limits.sag: unit 'mm' does not fit: needs a number"),
+        ("30 deg\n", "30 deg\n      sag: 0 mrad\n", 15, "limits.sag: has to be above 0"),
+        ("30 deg\n", "30 deg\n      sag: -1 mrad\n", 15, "limits.sag: has to be above 0"),
+        ("30 deg\n", "30 deg\n      sag: 42 mrad\n", 15,
+         "0.042 rad is more than 0.04189 rad, 1 % of the travel"),
+        ("30 deg\n", "2 deg\n      sag: 40 mrad\n", 15,
+         "0.04 rad is more than 0.03491 rad, the following error limit"),
+        ("    limits:", "    may_float: true\n    limits:\n      sag: 5 mrad", 11,
+         "limits.sag: an axis that may float (`may_float: true`) has no weight"),
     ],
 )  # fmt: skip
 def test_a_fault_is_said_in_plain_words_with_its_line(tmp_path, old, new, line, said):
@@ -73,6 +84,15 @@ def test_a_fault_is_said_in_plain_words_with_its_line(tmp_path, old, new, line, 
     assert said in text
     assert text.startswith(f"{path}:{line}: ")
     assert not [word for word in PROGRAMMERS if word in text.removeprefix(str(path))]
+
+
+@pytest.mark.parametrize("sag", ["41 mrad", "2 deg", None])
+def test_how_far_an_axis_may_sag_is_a_limit_that_may_be_left_out(tmp_path, sag):
+    path = tmp_path / "m.yaml"
+    more = f"      sag: {sag}\n" if sag else ""
+    path.write_text(GOOD.replace("30 deg\n", f"30 deg\n{more}"), encoding="utf-8")
+    found = load_machine(path).axes[0].limits.watched.sag
+    assert found == (None if sag is None else pytest.approx(parse_quantity(sag, "angle")))
 
 
 @pytest.mark.parametrize("text", ["1e-3", "1.5e3", "-.5E2", "2.e+1", "7e-10", " 3E0 "])

@@ -203,6 +203,7 @@ def test_schemas_are_json_and_show_limits_as_they_are_written():
     schema = json.loads(json.dumps(json_schema("machine")))
     limits = schema["$defs"]["Limits"]
     assert limits["properties"]["velocity"]["type"] == "string"
+    assert limits["properties"]["sag"]["type"] == "string"
     assert set(limits["required"]) == {
         "travel",
         "velocity",
