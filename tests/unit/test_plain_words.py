@@ -62,7 +62,7 @@ PROGRAMMERS = (
         ("bus: {", "bus: {bitrate: 500 kbit/s, ", 3, "number without a unit belongs here, in bit/s,"),
         ("name: table", "name: größe", 5, "axis größe, name: is a letter, then up to 31 letters"),
         ("30 deg\n", "30 deg\n      sag: 0.01\n", 15, "axis table, limits.sag: 0.01 has no unit"),
-        ("30 deg\n", "30 deg\n      sag: 2 mm\n", 15, "limits.sag: unit 'mm' does not fit: needs a number"),
+        ("30 deg\n", "30 deg\n      sag: 2 mm\n", 15, "limits.sag: unit 'mm' does not fit: needs"),
         ("30 deg\n", "30 deg\n      sag: 0 mrad\n", 15, "limits.sag: has to be above 0"),
         ("30 deg\n", "30 deg\n      sag: -1 mrad\n", 15, "limits.sag: has to be above 0"),
         ("30 deg\n", "30 deg\n      sag: 42 mrad\n", 15,
