@@ -720,7 +720,11 @@ def follow_position(signals, settings, target, steps, step):  # type: ignore[no-
     velocity = (target - signals[Signal.POSITION_REFERENCE]) / (steps * step)
     change = 0.0
     if before == Reference.POSITION or before == Reference.PROFILE:  # noqa: PLR1714
-        change = velocity - signals[Signal.VELOCITY_REFERENCE]
+        last = signals[Signal.VELOCITY_REFERENCE]
+        if before == Reference.POSITION and last == 0.0:  # it stands at its target: a late SYNC
+            way = signals[Signal.TARGET] - signals[Signal.INTERVAL_START]
+            last = way / (signals[Signal.INTERVAL_STEPS] * step)
+        change = velocity - last
     signals[Signal.REFERENCE] = float(POSITION_MODE)
     signals[Signal.INTERVAL_START] = signals[Signal.POSITION_REFERENCE]
     signals[Signal.INTERVAL_STEPS] = steps

@@ -354,6 +354,17 @@ def test_first_interval_has_no_acceleration() -> None:
     assert axes.reference_torque(0) == pytest.approx(0.01 * (RATE / 8) ** 2)
 
 
+@pytest.mark.parametrize("late", [0, 1, 5])
+def test_a_target_that_comes_late_is_no_jerk(late: int) -> None:
+    """The reference waits at the last target; what is fed forward is the targets' second difference."""
+    axes = rigid_axis()
+    axes.set(0, P.INERTIA_FF, 1.0)
+    for target, steps in ((0.01, 8), (0.03, 8 + late), (0.06, 1)):
+        axes.follow_position(0, target, 8)
+        axes.advance(steps)
+    assert axes.reference_torque(0) == pytest.approx(0.01 * (RATE / 8) ** 2)
+
+
 def test_position_limits_clamp_targets() -> None:
     axes = tuned_axis()
     axes.set(0, P.POSITION_MIN, -0.1)
