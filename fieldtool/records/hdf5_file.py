@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import count
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from struct import Struct
@@ -25,6 +26,9 @@ _ENTRY = Struct("<H6xQ")
 """Number, 0 for free room, and size."""
 
 
+_numbers = count()
+
+
 class MemoryFile:
     """An HDF5 file in memory; :meth:`write` puts a whole, valid copy of it on the disk.
 
@@ -33,7 +37,8 @@ class MemoryFile:
     """
 
     def __init__(self, file_format: str) -> None:
-        self.root = h5py.File("in-memory.h5", "w", driver="core", backing_store=False)
+        name = f"in-memory-{next(_numbers)}.h5"  # HDF5 opens none twice, not in memory either
+        self.root = h5py.File(name, "w", driver="core", backing_store=False)
         self.root.attrs["format"] = file_format
 
     def write(self, path: Path | str) -> None:

@@ -13,6 +13,7 @@ import pytest
 
 from fieldtool.errors import FileFormatError, OutputError
 from fieldtool.records.csv_folder import read_folder, write_folder
+from fieldtool.records.hdf5_file import MemoryFile
 from fieldtool.records.recording import (
     AxisInfo,
     Controller,
@@ -382,3 +383,14 @@ def _replace(group: h5py.Group, name: str, values: np.ndarray) -> None:
 
 def _no_space(_: int) -> None:
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def test_several_files_are_in_memory_at_once(tmp_path):
+    """One that an error left open kept all later ones of its process from being written."""
+    files = [MemoryFile(f"some-format/{k}") for k in range(3)]
+    for k, file in enumerate(files):
+        file.write(tmp_path / f"{k}.h5")
+    for k, file in enumerate(files):
+        file.close()
+        with h5py.File(tmp_path / f"{k}.h5", "r") as read:
+            assert read.attrs["format"] == f"some-format/{k}"
