@@ -6,7 +6,6 @@ from typing import Annotated
 import typer
 
 from fieldtool import workflow
-from fieldtool.cli.options import check_output
 from fieldtool.cli.output import console_of
 
 
@@ -15,7 +14,6 @@ def import_(
     out: Annotated[Path, typer.Option("-o", "--out", help="Recording to write (FILE.h5).")],
 ) -> None:
     """Turn a folder with recording.yaml and CSV files into a recording."""
-    check_output("--out", out)
     recording = workflow.import_folder(folder, out)
     rows = sum(e.samples for e in recording.experiments)
     console_of(False).print(f"{out}: {len(recording.experiments)} experiments, {rows} rows.")

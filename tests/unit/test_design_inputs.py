@@ -524,7 +524,6 @@ def test_what_stands_against_a_design_is_said_with_what_can_still_be_done(
         ("criticise", "--picture"),
         ("criticise", "--report"),
         ("report", "--out"),
-        ("import", "--out"),
     ],
 )
 @pytest.mark.parametrize(
