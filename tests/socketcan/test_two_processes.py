@@ -187,7 +187,7 @@ def test_the_whole_job(drives, listener, tmp_path) -> None:
             [sys.executable, "-m", "fieldtool", *arguments, "--yes", "--json"],
             capture_output=True,
             text=True,
-            timeout=3 * PATIENCE,
+            timeout=5 * PATIENCE,
             check=False,
         )
         print(done.stderr)
