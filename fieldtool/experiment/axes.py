@@ -132,20 +132,6 @@ def positioning_move(axes: Axes, k: int, distance: float, step: float) -> FloatA
     )
 
 
-def sag_words(sag: float | None, unit: str) -> str:
-    """Say what to do about an axis that moved as it was enabled, and may have sagged."""
-    if sag is None:
-        return (
-            "Secure it against falling and look before you enable it again. Only if its weight pulls "
-            "it down a little and its loop then holds it: raise its gains velocity_i and position_p, or "
-            "write how far it may sink as `sag` into its limits in the machine profile."
-        )
-    return (
-        f"Its limit `sag` in the machine profile is {sag:.3g} {unit}, which counts only while drives "
-        "are being enabled: if it sags farther, raise its gains velocity_i and position_p."
-    )
-
-
 class Standstill:
     """Tells whether axes have stood for STILL_TIME, wherever that is, or STILL_TIMEOUT is up.
 

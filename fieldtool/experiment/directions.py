@@ -16,7 +16,6 @@ from fieldtool.experiment.axes import (
     Standstill,
     keep_all,
     keep_whatever_happens,
-    sag_words,
     sample_times,
     until_still,
 )
@@ -433,6 +432,20 @@ class _DirectionCheck:
             )
 
 
+def _sag_words(sag: float | None, unit: str) -> str:
+    """Say what to do about an axis that moved as it was enabled, and may have sagged."""
+    if sag is None:
+        return (
+            "Secure it against falling and look before you enable it again. Only if its weight pulls "
+            "it down a little and its loop then holds it: raise its gains velocity_i and position_p, or "
+            "write how far it may sink as `sag` into its limits in the machine profile."
+        )
+    return (
+        f"Its limit `sag` in the machine profile is {sag:.3g} {unit}, which counts only while drives "
+        "are being enabled: if it sags farther, raise its gains velocity_i and position_p."
+    )
+
+
 def _stay(axes: Axes, k: int, moved: float, offset: float, allowed: float) -> None:
     """Raise if it left where it stood; back to its first start, where its target is, it may go."""
     if not min(0.0, offset) - allowed <= moved <= max(0.0, offset) + allowed:
@@ -441,7 +454,7 @@ def _stay(axes: Axes, k: int, moved: float, offset: float, allowed: float) -> No
             f"{name}: moved by {moved - offset:.3g} {unit} while it was told to stand still; its "
             "power was cut and all axes were stopped. Either the axis moves the wrong way (check "
             "the encoder's direction and the motor's phases), or its loop is not stable, or it sags "
-            f"when its brake opens. {sag_words(sag, unit)}",
+            f"when its brake opens. {_sag_words(sag, unit)}",
             axis=name,
             runaway=True,
         )

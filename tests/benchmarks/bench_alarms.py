@@ -44,7 +44,7 @@ from drives.canopen_drive.channel import Channel
 from drives.canopen_drive.energy import Balance
 from drives.canopen_drive.motion import CanopenMotion
 from drives.canopen_drive.pace import LATE_SHARE
-from drives.canopen_drive.sync import Early, HostSync
+from drives.canopen_drive.sync import HostSync
 from drives.canopen_drive.unseen import STOOD, Unseen
 from drives.profile import load_machine
 from drives.sim.faults import MotorReversed
@@ -53,6 +53,7 @@ from drives.sim.machine import simulated_machine
 from drives.sim.running import RunningMachine
 from drives.sim.state_machine import State
 from tests.faults.bench import command
+from tests.late_syncs import giving_late
 from tests.session.conftest import two_axes
 
 TORQUE = 6.0
@@ -263,7 +264,7 @@ class Bench:
         self._seen: Callable[[], None] = lambda: None
         self._watch_unseen()
         self._watch_energy()
-        self._have_late_syncs()
+        HostSync.give = giving_late(self._lateness)  # type: ignore[method-assign]
 
     def _loses(self, watch: object, cycles: float) -> float | None:
         """Return the cycles since a watch's last sample; None where it does not get this one."""
@@ -273,18 +274,11 @@ class Bench:
             return None
         return cycles
 
-    def _have_late_syncs(self) -> None:
-        give = HostSync.give
-
-        def given(sync: HostSync, early: Early) -> float:
-            if self.late and self._rng.random() < LATE:
-                clock, cycle = sync._line.clock, sync._cycle_time
-                late = min(self._rng.exponential(LATE_BY), LATE_SHARE / 2) * cycle
-                clock.wait_until(clock.now() + late)
-                sync._start += late  # virtual time goes on by whole cycles from there
-            return give(sync, early)
-
-        HostSync.give = given  # type: ignore[method-assign]
+    def _lateness(self, cycle: float) -> float:
+        """Return by how many seconds the next SYNC is late."""
+        if not self.late or self._rng.random() >= LATE:
+            return 0.0
+        return min(self._rng.exponential(LATE_BY), LATE_SHARE / 2) * cycle
 
     def _watch_unseen(self) -> None:
         take = Unseen.take

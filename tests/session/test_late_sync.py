@@ -15,6 +15,7 @@ from drives.sim.faults import MotorReversed
 from drives.sim.lockstep_bus import register, unregister
 from drives.sim.machine import simulated_machine
 from fieldtool.experiment.verification.trial import run_trial
+from tests.late_syncs import giving_late
 from tests.session.test_trial import Gains, axes_of, move, trial
 
 MACHINE = Path(__file__).parents[1] / "socketcan" / "machine.yaml"
@@ -104,16 +105,11 @@ FED = np.array([[40.0, 80.0], [0.0, 0.0]])
 
 def late_by(rng, mean):
     """Have one SYNC in three come late by this mean time, s, and those after it in time again."""
-    give = HostSync.give
 
-    def given(sync, early):
-        if rng.random() < 0.3:
-            clock, late = sync._line.clock, min(rng.exponential(mean), 0.2 * STEP)
-            clock.wait_until(clock.now() + late)
-            sync._start += late
-        return give(sync, early)
+    def seconds(cycle):
+        return min(rng.exponential(mean), 0.2 * cycle) if rng.random() < 0.3 else 0.0
 
-    return patch.object(HostSync, "give", given)
+    return patch.object(HostSync, "give", giving_late(seconds))
 
 
 def slow_trial():
