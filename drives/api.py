@@ -132,6 +132,9 @@ class Alarm:
     """Name of the axis that shows it most."""
     power_off: frozenset[str]
     """Axes whose own loops make it: a quick stop would leave them closed, so their power is cut."""
+    held_up: float = 0.0
+    """Seconds by which the host began a cycle of moving targets late shortly before, which alone may
+    have made it; else 0."""
 
 
 class MotionWatch(Protocol):

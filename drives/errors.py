@@ -127,8 +127,8 @@ class SafetyStopError(StoppedError):
     ) -> None:
         self.axis, self.cycle = axis, cycle
         self.held_up = held_up
-        """Seconds by which the host began a cycle of moving targets late, if that is all that was wrong;
-        else 0, also where drives miss a host that is so late."""
+        """Seconds by which the host began a cycle of moving targets late, if that alone may have done
+        it; else 0, also where drives miss a host that is so late."""
         self.runaway = runaway
         """The axis moves by itself: a quick stop may make it worse, its power is cut at once."""
         self.power_off = frozenset(power_off) | ({axis} if runaway and axis else frozenset())

@@ -701,6 +701,7 @@ class CanopenMotion:
                 axis=alarm.axis,
                 cycle=self._count - 1,
                 power_off=alarm.power_off,
+                held_up=alarm.held_up,
             )
 
 

@@ -19,6 +19,8 @@ PULL, MOST_PULL = 0.3, 0.2
 """Share of the kernel's lateness that its next period makes up for, and largest change of a period."""
 OLDEST = 5.0
 """Seconds that a frame may have waited to be read; more, or less than none: the clock was set."""
+AT_ONCE, READINGS = 2e-4, 10
+"""Seconds within which two clocks are read, and times that it is tried."""
 GONE = 1.5
 """Cycles without the kernel's SYNC after which its lease has ended."""
 IN_VAIN = 10
@@ -182,9 +184,17 @@ class KernelSync(HostSync):
     def _moment(self, message: can.Message) -> float:
         """Return when a frame came, by the bus' clock, which nobody sets: the kernel stamps by its
         time of day.
+
+        Both clocks are read at once, again where the host was held up in between: the frame would
+        seem to have come as much later.
         """
-        age = time.time() - message.timestamp
-        return self._line.clock.now() - (age if 0 <= age <= OLDEST else 0.0)
+        clock = self._line.clock
+        for _ in range(READINGS):
+            before, day, now = clock.now(), time.time(), clock.now()
+            if now - before < AT_ONCE:
+                break
+        age = day - message.timestamp
+        return now - (age if 0 <= age <= OLDEST else 0.0)
 
     def _follow(self, moment: float, overtaken: float) -> None:
         """Take note of how late a SYNC was, and choose the next period."""

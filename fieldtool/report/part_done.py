@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from datetime import datetime
 from typing import Any
 
+from fieldtool.experiment.multisine.passes import AS_IT_CAME
 from fieldtool.records.recording import Experiment, Recording
 from fieldtool.report.material import Event, Material
 from fieldtool.report.section import Block, Section, Table, Words
@@ -59,12 +60,13 @@ def _tried(material: Material) -> str:
 
 
 def _measured(recording: Recording) -> str:
-    whole = [e for e in recording.experiments if e.complete]
-    seconds = sum(e.samples for e in recording.experiments) * recording.sample_period
-    cut = len(recording.experiments) - len(whole)
+    as_they_came = {e.name for e in recording.experiments if e.name.endswith(AS_IT_CAME)}
+    every = [e for e in recording.experiments if e.name + AS_IT_CAME not in as_they_came]
+    seconds = sum(e.samples for e in every) * recording.sample_period
+    cut = sum(_cut(e) for e in every)
     more = f", {cut} of them cut short" if cut else ""
     return (
-        f"{len(recording.experiments)} experiments{more}, {seconds:.3g} s of machine time, a "
+        f"{len(every)} experiments{more}, {seconds:.3g} s of machine time, a "
         f"sample every {recording.sample_period * 1000:g} ms"
     )
 
@@ -138,8 +140,12 @@ def done(material: Material) -> Section | None:
     return Section("What was done", "", tuple(blocks))
 
 
+def _cut(e: Experiment) -> bool:
+    return not e.complete and not e.name.endswith(AS_IT_CAME)
+
+
 def _experiment(e: Experiment, step: float) -> tuple[str, ...]:
-    note = e.note if e.complete else f"cut short. {e.note}".strip()
+    note = f"cut short. {e.note}".strip() if _cut(e) else e.note
     period = f"{e.period:.3g} s" if e.period else ""
     return e.name, KINDS[e.kind], ", ".join(e.driven), f"{e.samples * step:.3g} s", period, note
 

@@ -126,15 +126,18 @@ class Verification:
             wait_for_standstill(self._group)
         except PlanRefusedError as error:
             raise PlanRefusedError(f"{error} Nothing was moved or written.") from None
-        designed = self._tuning.prediction if self._believed else None
-        self._plan = plan_trial(
-            self._group, self._setting, changes, self._bound, self._stated, designed
-        )
+        self._plan = plan = self._plan_here()
         if self._believed and self._tuning.response != SOFTEST:
-            check_no_worse(self._plan.before, self._plan.after, self._plan.trial.cycle_time)
-        for note in self._plan.notes:
+            check_no_worse(plan.before, plan.after, plan.trial.cycle_time)
+        for note in plan.notes:
             self._session.warn(note)
-        return self._plan
+        return plan
+
+    def _plan_here(self) -> TrialPlan:
+        designed = self._tuning.prediction if self._believed else None
+        return plan_trial(
+            self._group, self._setting, self._changes, self._bound, self._stated, designed
+        )
 
     def before(self) -> None:
         """Try the parameters that are in the drives.
@@ -219,21 +222,30 @@ class Verification:
         """Do a trial; once more where this computer was late in a move, which stopped it.
 
         That is no word on the loops.  All drives are disabled in between, and nothing begins anew that
-        a person stopped, that left anything to be said, or that may have changed what is known.
+        a person stopped, that left anything to be said, or that may have changed what is known; nor
+        anything with new parameters after an alarm, whatever may have made it.
         """
         began = [drive.read_position() for drive in self._group.drives]
         for left, label in zip(reversed(range(TRIALS)), _labels(name), strict=True):
             try:
                 return self._try(name, label, keep, trusts_loops=trusts_loops)
             except SafetyStopError as error:
+                why = "That says nothing of the loops"
+                if isinstance(error, OscillationError) and error.held_up:
+                    why = (
+                        f"Shortly before, this computer was {1000 * error.held_up:.0f} ms late in the "
+                        "move: that alone may have done it"
+                    )
+                    if not left or name != "before":
+                        error.add_note(f"{why}. Close other programs, and write again.")
                 if not left or not error.held_up or hasattr(error, "__notes__"):
                     raise
                 if blocked := self._blocked(began, name):
                     error.add_note(f"The trial could not be begun again: {blocked}")
                     raise
                 self._session.warn(
-                    f"{error} That says nothing of the loops: the trial is begun again, {left} "
-                    f"time{'s' if left > 1 else ''} at most."
+                    f"{error} {why}: the trial is begun again, {left} time{'s' if left > 1 else ''} at "
+                    "most."
                 )
                 if name == "before":
                     self._guards = None  # it begins where the axes stand now, and learns anew
@@ -242,8 +254,9 @@ class Verification:
     def _blocked(self, began: Sequence[float], name: str) -> str:
         """Say why a trial can not be begun again where the axes stand now; empty if it can.
 
-        The old parameters' trial begins from anywhere and learns anew.  With the new ones it is compared
-        with torques at rest that are known where the old one began.
+        The old parameters' trial begins from anywhere, by other moves where there is no room for those
+        that were planned, and learns anew.  With the new ones it is compared with torques at rest that
+        are known where the old one began.
 
         Raises
         ------
@@ -254,7 +267,13 @@ class Verification:
         try:
             wait_for_standstill(self._group)
             if text := no_room(self._group, self._planned.trial):
-                return text
+                if name != "before":
+                    return text
+                try:
+                    self._plan = self._plan_here()
+                except PlanRefusedError:
+                    return text
+                self._session.screen.say(_what_moves(self._plan, self._axes))
             now = [drive.read_position() for drive in self._group.drives]
         except UserStopError:
             raise

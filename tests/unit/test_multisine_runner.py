@@ -3,6 +3,7 @@
 The fake does not imitate: drives, a bus, quantisation, quick stops; it keeps no limits.
 """
 
+import re
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -230,28 +231,98 @@ def test_experiments_follow_each_other_and_are_periodic(torque: float) -> None:
     assert np.diff([p.machine_time for p in told]).max() < 0.4
 
 
-@pytest.mark.parametrize("row", [100, SETTLE + 5, SETTLE + SAMPLES + 5, SETTLE + 3 * SAMPLES - 1])
-def test_a_spoiled_period_is_measured_again(row: int) -> None:
-    kept, _, _ = run(FakeGroup(missing=frozenset({row})), plan())
-    bad = max(0, (row - SETTLE) // SAMPLES + 1) if row >= SETTLE else 0
-    assert kept[0].samples == SETTLE + (3 + bad) * SAMPLES
-    assert kept[1].samples == SETTLE + 3 * SAMPLES
-    assert ("missing samples" in kept[0].note) == bool(bad)
-    assert kept[0].position_reference is not None
-    whole = kept[0].position_reference[-3 * SAMPLES :].reshape(3, SAMPLES, 2)
+TAIL = SAMPLES // 3 + 1
+"""Rows that a late cycle spoils: a period of the lowest line, which is the third."""
+
+
+def late(*missing: int) -> Spoil:
+    """A machine that is pushed away where a sample is missing, and comes back within the tail."""
+
+    def spoil(rows: np.ndarray, position: np.ndarray, torque: np.ndarray) -> None:
+        for row in missing:
+            after = (rows >= row) & (rows < row + TAIL)
+            position[after] += 0.01
+            torque[after] += 100.0
+
+    return spoil
+
+
+def of_the_first(experiment: Experiment) -> np.ndarray:
+    """Return positions of the periods that count; run undisturbed, for comparison."""
+    return last_rows(experiment)
+
+
+@pytest.mark.parametrize(
+    ("missing", "more"),
+    [
+        ((100,), 0),
+        ((SETTLE - 5,), 1),
+        ((SETTLE + 5,), 1),
+        ((SETTLE + SAMPLES + 5,), 1),
+        ((SETTLE + 3 * SAMPLES - 1,), 1),
+        ((SETTLE + 5, SETTLE + 200, SETTLE + SAMPLES + 300, SETTLE + 2 * SAMPLES + 7), 2),
+        ((SETTLE + 50, SETTLE + SAMPLES + 50, SETTLE + 2 * SAMPLES + 50), 3),
+        (tuple(SETTLE + k * SAMPLES + 150 * k % SAMPLES for k in range(4)), 2),
+    ],
+)
+def test_what_a_late_cycle_spoils_is_measured_again(missing: tuple[int, ...], more: int) -> None:
+    """Whole periods are put together from rows that nothing disturbed, and all that came is kept."""
+    spoil = late(*missing)
+    (plain, _), _, _ = run(FakeGroup(), plan())
+    kept, told, _ = run(FakeGroup(spoil, missing=frozenset(missing)), plan())
+    *before, whole, following = kept
+    assert (whole.name, following.name) == ("multisine 1", "multisine 2")
+    assert whole.complete
+    assert whole.samples == following.samples == SETTLE + 3 * SAMPLES
+    assert following.note == ""
+    np.testing.assert_allclose(of_the_first(whole), of_the_first(plain), atol=2e-4)
     np.testing.assert_allclose(
-        whole, np.stack([plan().experiments[0].one_period()] * 3), atol=1e-12
+        whole.position_reference[SETTLE:], plain.position_reference[SETTLE:], atol=1e-12
     )
+    assert np.array_equal(whole.time, plain.time)
+    assert not [p for p in told if p.period > 3 or p.seconds_left < 0]
+    if not more:
+        assert not before
+        assert whole.note == ""
+        return
+    (every,) = before
+    assert (every.name, every.kind, every.complete) == ("multisine 1, as it came", "other", False)
+    assert every.samples == SETTLE + (3 + more) * SAMPLES
+    assert f"{more} periods more, because cycles were late or samples missing" in every.note
+    rows = sum(int(n) for n in re.findall(r"(\d+) of period \d", whole.note))
+    assert rows == 3 * SAMPLES
+    pushed = np.zeros((every.samples, 2))
+    spoil(np.arange(every.samples), pushed, np.zeros_like(pushed))
+    assert np.ptp(every.position - pushed, axis=0) == pytest.approx(
+        np.ptp(plain.position, axis=0), rel=0.02
+    ), "as it came"
 
 
 def test_too_many_gaps_end_it_with_a_sentence() -> None:
     gaps = frozenset(range(SETTLE, 100_000, SAMPLES // 2))
     kept, error = failing(FakeGroup(missing=gaps), plan())
     assert isinstance(error, NotEnoughDataError)
-    assert "3 whole periods of 2 s without a missing sample were not to be had in 6" in str(error)
+    assert "3 whole periods of 2 s without a missing sample were not to be had in 18" in str(error)
     (experiment,) = kept
     assert not experiment.complete
-    assert experiment.samples <= SETTLE + 6 * SAMPLES
+    assert experiment.kind == "multisine"
+    assert experiment.samples == SETTLE + 18 * SAMPLES
+
+
+def test_with_a_bias_velocity_it_is_not_begun_for_ever() -> None:
+    gaps = frozenset(range(SETTLE, 100_000, SAMPLES // 2))
+    kept, error = failing(FakeGroup(missing=gaps), plan(bias=np.array([0.04, -0.02]), periods=2))
+    assert isinstance(error, NotEnoughDataError)
+    assert (
+        "2 whole periods of 2 s without a missing sample were not to be had in 3 attempts"
+        in str(error)
+    )
+    assert [e.name for e in kept] == [
+        "multisine 1, attempt 1",
+        "multisine 1, attempt 2",
+        "multisine 1",
+    ]
+    assert not any(e.complete for e in kept)
 
 
 def test_with_a_bias_velocity_a_spoiled_experiment_is_repeated() -> None:
@@ -446,6 +517,26 @@ def test_no_alarm_where_nothing_grows_by_itself(kind: str, fresh_rng: np.random.
         block = signal[begin : begin + 50]
         growth = watch.take(block, 0.5 * block)
         assert growth is None, f"{growth} at {begin * STEP:.2f} s"
+
+
+@pytest.mark.parametrize("seed", [32, 67, 205, 2456734483])
+def test_friction_that_comes_and_goes_is_no_growing_oscillation(seed: int) -> None:
+    """Larger and larger three times in a row, and out of what the last seconds showed: by chance."""
+    test_no_alarm_where_nothing_grows_by_itself("stick-slip", np.random.default_rng(seed))
+
+
+def test_what_swung_long_ago_does_not_hide_an_oscillation_that_grows() -> None:
+    n, start = 8000, 6000
+    t = STEP * np.arange(n)[:, None]
+    once = 0.2 * np.sin(2 * np.pi * 7 * t) * (np.abs(t - 10) < 3)
+    size = 0.01 * np.exp(np.maximum(t - STEP * start, 0) / 0.5) * (t > STEP * start)
+    signal = 0.3 * np.sin(2 * np.pi * 1.5 * t) + once + size * np.sin(2 * np.pi * 6 * t)
+    watch = GrowthWatch(SAMPLES, SETTLE, np.ones(1), np.ones(1), np.full(1, 0.4), STEP)
+    found = [(k, watch.take(signal[k : k + 50], 0 * signal[k : k + 50])) for k in range(0, n, 50)]
+    first, growth = next(one for one in found if one[1] is not None)
+    assert first >= start
+    assert growth.frequency == pytest.approx(6.0, rel=0.15)
+    assert growth.share < 0.9
 
 
 # -- clipping -------------------------------------------------------------------------------------

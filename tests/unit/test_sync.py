@@ -91,6 +91,28 @@ def test_a_host_that_comes_late_is_late(kernel):
     assert beat.late == 1
 
 
+@pytest.mark.parametrize("before_the_day", [True, False])
+def test_a_host_held_up_between_its_two_clocks_knows_when_the_sync_came(
+    kernel, monkeypatch, before_the_day
+):
+    beat = KernelSync(kernel, CYCLE)
+    cycles(kernel, beat, 5)
+    pauses = [0.043]
+
+    def day() -> float:
+        said = kernel.day
+        if pauses:
+            kernel.pass_by(pauses.pop())
+            said = kernel.day if before_the_day else said
+        return said
+
+    monkeypatch.setattr(sync.time, "time", day)
+    (moment,) = cycles(kernel, beat, 1)
+    assert not pauses
+    assert moment == pytest.approx(5.0 + 6 * CYCLE)
+    assert beat.late == 0, "the SYNC was in time"
+
+
 @pytest.mark.parametrize("how", [{"is_error_frame": True}, {"is_remote_frame": True}])
 def test_what_only_looks_like_a_sync_is_none(beat_on, how):
     class Likeness(Kernel):

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
-from drives.api import AxisLimits
+from drives.api import Alarm, AxisLimits
 from fieldtool.design.servo import Servo, Timing
 from fieldtool.experiment.verification.controller import (
     FROM_POSITION,
@@ -25,7 +25,7 @@ from fieldtool.experiment.verification.controller import (
 from fieldtool.experiment.verification.identity import BLIND, IdentityWatch
 from fieldtool.experiment.verification.learned import Learned
 from fieldtool.experiment.verification.watch import Guards, TrialWatch
-from fieldtool.experiment.verification.work import WorkWatch
+from fieldtool.experiment.verification.work import WorkRecord, WorkWatch
 from fieldtool.records.closed_loop import AxisLoop, Biquad
 from fieldtool.workflow import trial_records
 from fieldtool.workflow.design_inputs import timing_of
@@ -294,6 +294,9 @@ TIMES = {
 @example(99.5, 2.487, 0.25, 0.78, 0.86, 2.2, 0.0, False, False, True, 16.0, 1, 32, 0.08e-3, False)
 @example(100, 3.0, 0.25, 0.5, 0.0, 0.0, 0.0, False, False, True, 1.0, 5, 16, 0.06e-3, False)
 @example(68, 3.0, 0.25, 0.5, 0.0, 0.0, 0.0, False, False, False, 1.0, 29, 32, 0.15e-3, False)
+@example(15.0, 2.0, 0.25, 0.0, 0.0, 0.0, 0.0, True, False, False, 16.0, 0, 1, 1e-3, False)
+@example(22.84, 2.207, 0.1, 0.41, 1.0, 0.56, 0.0, True, False, False, 16.0, 53672467, 2, 1e-3, True)
+@example(15.0, 4.23, 0.3, 0.386, 0.0, 4.0, 0.0, True, False, False, 16.0, 1599907105, 1, 5e-5, True)
 def test_a_sound_drive_is_never_doubted_whatever_the_period_that_nobody_knows(
     bandwidth,
     ratio,
@@ -650,6 +653,30 @@ def test_a_torque_at_rest_that_was_told_of_a_creeping_axis_is_no_reversed_motor(
     assert any(found) == (unsure == 0)
 
 
+@pytest.mark.parametrize("spring", [1.5, 2.5, 5.0])
+def test_what_swings_when_a_sample_is_lost_is_no_reversed_motor(spring):
+    """A soft loop is pushed by its own load; what that took up before the gap nobody knows any more."""
+    soft, load = AxisLoop(4.0, 20.0 * INERTIA, 30.0 * INERTIA, 1.0), 0.6 * INERTIA
+    stiffness = 0.4 * load * (2 * np.pi * spring) ** 2
+    u = np.arange(500) / 500
+    nudge = 0.02 * u**3 * (10 - 15 * u + 6 * u * u)
+    path = np.concatenate([np.zeros(50), nudge, np.full(500, 0.02), 0.02 - nudge, np.zeros(500)])
+    position, torque = Axis(soft, load=load, spring=stiffness).run(path)
+    rest = (np.array([one]) for one in (0.0, COUNT, LIMIT, 1e-3 * LIMIT, INERTIA / STEP**2))
+    known = tuple(rest)
+    for lost in range(60, path.size, 41):
+        record, judge = WorkRecord(), WorkWatch(*known, ["rad"])
+        for one in (record, judge):
+            one.begin(moves=True)
+            for n, (q, t) in enumerate(zip(position, torque, strict=True)):
+                assert not one.take([q], [t], fresh=n != lost)
+        assert record.most(WorkWatch(*known, ["rad"])) <= 1.0, "nor is it learned as usual"
+        judge.begin(moves=True)
+        assert any(judge.take([-1e-6 * n * n], [1.0], fresh=True) for n in range(200)), (
+            "it looks again"
+        )
+
+
 def test_a_lost_sample_ends_what_is_reckoned_of_work():
     work = WorkWatch(
         *(np.array([one]) for one in (0.0, COUNT, LIMIT, 1e-3 * LIMIT, INERTIA / STEP**2)), ["rad"]
@@ -659,6 +686,39 @@ def test_a_lost_sample_ends_what_is_reckoned_of_work():
     for n in range(200):
         guarded.take([n * COUNT], [-5.0], [0.0], [0.0], fresh=n % 20 != 19, late=0.0)
         assert n % 20 != 19 or work.missing == 0.0
+
+
+@pytest.mark.parametrize(
+    ("late", "moves", "after", "held_up"),
+    [
+        (0.015, True, 40, 0.015),
+        (0.015, True, 60, 0.0),
+        (0.015, False, 1, 0.0),
+        (0.002, True, 1, 0.0),
+        (0.002, False, 1, 0.0),
+    ],
+)
+def test_an_alarm_says_whether_the_host_was_late_shortly_before(late, moves, after, held_up):
+    """Of cycles of 10 ms; within half a second; more than a quarter of a cycle; while targets moved."""
+
+    class Swings(Blind):
+        now = False
+
+        def take(self, position, torque, smooth):
+            return Alarm("x: swings", "x", frozenset({"x"})) if self.now else None
+
+    swings = Swings()
+    watched = TrialWatch(["x"], swings, Guards(), cycle_time=0.01)
+    watched.begin()
+    for n in range(5 + after):
+        target = [float(n if moves else min(n, 3))]
+        at = late if n == 5 else 0.0
+        watched.take([0.0], [0.0], target, [0.0], fresh=not at, late=at)
+    swings.now = True
+    alarm = watched.take([0.0], [0.0], target, [0.0], fresh=True, late=0.0)
+    assert alarm.held_up == held_up
+    watched.begin()
+    assert watched.take([0.0], [0.0], [0.0], [0.0], fresh=True, late=0.0).held_up == 0.0
 
 
 @pytest.mark.parametrize("by_torque", [True, False])

@@ -25,8 +25,8 @@ TURNS = 5
 """Times that it turns to the other side of its mean in these stretches, at least: no mere push."""
 ONE_FREQUENCY = 0.8
 """Share of its power about one frequency, once its growth is taken out: no mere noise."""
-BEFORE, AT_LEAST = 12, 2
-"""They are compared with so many stretches before these, or with what there is, but so many at least."""
+AT_LEAST = 2
+"""They are compared with all stretches before these, of which there have to be so many."""
 OUT_OF_THE_USUAL, LARGER_THAN_ALL = 4.0, 2.0
 """The last one is larger by these than the median, and than the largest, of the stretches before."""
 SHARE_OF_LIMIT = 0.25
@@ -162,7 +162,7 @@ class _Trail:
         grown: NDArray[np.bool_] = np.all(level[1:] > RISE * level[:-1], axis=0)
         grown &= level[-1] > threshold
         if compare and np.any(grown):
-            count = min(BEFORE, self.rows // length - RISES - 1)
+            count = self.rows // length - RISES - 1
             if count < AT_LEAST:
                 return np.zeros_like(grown)
             before = self.levels(length, RISES + 1, count)

@@ -77,9 +77,10 @@ def run_multisine(
     axes
         Names, limits, centres.
     keep
-        Gets each experiment's raw data once the drives are off, also when it was cut short.  The last
-        ``periods * samples`` rows of a complete one are whole periods without a missing sample; the
-        rows before are its run-in.  One that was given up, to be repeated, is of kind ``other``.
+        Gets each experiment's raw data once the drives are off, also when it was cut short.  A
+        complete one is the ``settle`` rows of its run-in, then ``periods * samples`` rows: whole
+        periods without a disturbed row.  Where it went on for longer to have them, all its rows in
+        their order come before it, of kind ``other``, and so is one that was given up, to be repeated.
     report
         Called after every block.
     expected_errors

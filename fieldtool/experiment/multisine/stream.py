@@ -3,8 +3,8 @@
 The excitation fades out at the end of a stream, whatever ends it, and the axes come to rest.
 """
 
-from collections.abc import Callable, Generator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Generator, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import chain, repeat
 
 import numpy as np
@@ -16,6 +16,13 @@ from fieldtool.experiment.axes import Axes, sample_times
 from fieldtool.experiment.multisine.clipping import clipped_samples
 from fieldtool.experiment.multisine.excitation import Excitation
 from fieldtool.experiment.multisine.growth import Growth, GrowthWatch, out_of_band
+from fieldtool.experiment.multisine.passes import (
+    AS_IT_CAME,
+    BoolArray,
+    IntArray,
+    sound_rows,
+    whole_periods,
+)
 from fieldtool.experiment.multisine.plan import MultisineExperiment
 from fieldtool.experiment.stepped.runner import OVERLOAD
 from fieldtool.records.recording import Experiment
@@ -25,8 +32,10 @@ BLOCK_TIME = 0.25
 HALVINGS = 4
 """Times that an experiment's amplitude is halved before the axis counts as overloaded by something
 else."""
-MOST_PERIODS = 2
-"""Times the planned periods that an experiment goes on for clean ones."""
+MOST_PERIODS = 6
+"""Times the planned periods that an experiment goes on until all of them are whole."""
+MOST_ATTEMPTS = 3
+"""Times that an experiment is begun which can not go on: with a bias velocity there is no room."""
 STOP_TIME, STOP_SHARE = 0.25, 0.5
 """An unstable loop's excitation ends in so many seconds at least, and with this share of the velocity
 and acceleration limits."""
@@ -69,6 +78,17 @@ class _Part:
     complete: bool = False
     given_up: bool = False
     notes: tuple[str, ...] = ()
+    missing: list[int] = field(default_factory=list)
+    """Rows, from its beginning."""
+
+    def sound(self, passes: int) -> BoolArray:
+        """Return which rows of so many passes are undisturbed, (passes, samples).
+
+        What a disturbance leaves swings for a period of the lowest line, as long as a fade-in takes.
+        """
+        one = self.job.experiment
+        tail = min(int(np.ceil(one.samples / one.lines[0])), one.settle)
+        return sound_rows(self.missing, tail, one.settle, one.samples, passes)
 
 
 class ExperimentStream:
@@ -108,14 +128,36 @@ class ExperimentStream:
     def experiments(self, capture: Capture, cut: str = "") -> list[Experiment]:
         """Return what was recorded; ``cut`` says why the stream did not end by itself."""
         return [
-            self._experiment(part, capture, cut)
-            for part in self._parts
-            if min(part.stop or capture.rows, capture.rows) - part.begin > 1
+            experiment for part in self._parts for experiment in self._recorded(part, capture, cut)
         ]
 
-    def _experiment(self, part: _Part, capture: Capture, cut: str) -> Experiment:
+    def _recorded(self, part: _Part, capture: Capture, cut: str) -> Iterator[Experiment]:
+        """Yield an experiment; where it had to go on, as it came, and its whole periods.
+
+        These have the rows of the run-in and of the planned periods, as without a disturbance.
+        """
+        one = part.job.experiment
+        rows = np.arange(part.begin, min(part.stop or capture.rows, capture.rows))
+        if rows.size < 2:
+            return
+        every = self._experiment(part, capture, rows, cut)
+        passes = (rows.size - one.settle) // one.samples
+        if not part.complete or passes == one.periods:
+            yield every
+            return
+        chosen = whole_periods(part.sound(passes), one.periods)
+        sources = one.settle + chosen * one.samples + np.arange(one.samples)
+        whole = np.concatenate([np.arange(one.settle), sources.ravel()])
+        mended = self._experiment(part, capture, rows[whole], cut)
+        name = one.name + AS_IT_CAME
+        why = f"{passes - one.periods} periods more, because cycles were late or samples missing"
+        yield replace(
+            every, name=name, kind="other", period=None, complete=False, note=_both(every.note, why)
+        )
+        yield replace(mended, note=_both(mended.note, _origin(chosen)))
+
+    def _experiment(self, part: _Part, capture: Capture, rows: IntArray, cut: str) -> Experiment:
         job, one, names = part.job, part.job.experiment, self._axes.names
-        rows = slice(part.begin, min(part.stop or capture.rows, capture.rows))
         notes = [job.note, *part.notes, "" if part.stop else cut]
         for name, torque in zip(names, capture.torque[rows].T, strict=True):
             clipped = clipped_samples(torque)
@@ -128,7 +170,7 @@ class ExperimentStream:
             driven=names,
             free=(),
             period=None if part.given_up else one.period,
-            time=sample_times(rows.stop - rows.start, self._step),
+            time=sample_times(rows.size, self._step),
             position=capture.position[rows],
             torque=capture.torque[rows],
             position_reference=capture.position_reference[rows],
@@ -137,7 +179,7 @@ class ExperimentStream:
             if offset is None
             else {f"{name}.torque_offset": offset[rows, k] for k, name in enumerate(names)},
             complete=part.complete,
-            note="; ".join(note for note in notes if note),
+            note=_both(*notes),
         )
 
     def _script(self) -> Generator[FloatArray | Targets, Capture, None]:
@@ -171,27 +213,27 @@ class ExperimentStream:
         part = _Part(job, self._row)
         self._parts.append(part)
         self._watch, self._watched = self._watch_of(job), self._row
-        done = clean = 0
+        clean = 0
         later = self._rows_of(following) + one.fade
         for stage, rows in enumerate(chain([one.settle], repeat(one.samples))):
-            spoiled, left = False, later + (one.periods - clean) * one.samples
+            left = later + (one.periods - clean) * one.samples
             left += one.settle if stage == 0 else 0
+            first = clean + 1 if stage else 0
             for n in _evenly(rows, self._block):
+                begin = self._row - part.begin
                 capture = yield self._targets(n)
                 left -= n
-                self._tell(n, job, min(stage, one.periods), left)
-                spoiled = spoiled or bool(capture.missing)
+                self._tell(n, job, first, left)
+                part.missing += [begin + row for row in capture.missing]
                 if self._gives_up(part, capture, following):
                     return False
             if stage == 0:
                 continue
-            done, clean = done + 1, 0 if spoiled else clean + 1
+            clean = int(part.sound(stage).sum(axis=0).min())
             if clean == one.periods:
                 part.stop, part.complete = self._row, True
-                if done > clean:
-                    part.notes += (f"{done - clean} periods with missing samples come before",)
                 return True
-            if spoiled and self._ends_for_gaps(part, done, following):
+            if clean < stage and self._ends_for_gaps(part, stage, following):
                 return False
         raise AssertionError("periods never end")
 
@@ -269,16 +311,17 @@ class ExperimentStream:
         """Say how an experiment ends that has had a period with missing samples."""
         job, one = part.job, part.job.experiment
         most = MOST_PERIODS * one.periods
-        if one.biased and job.attempt < MOST_PERIODS + job.halvings:  # no room to go on
+        if one.biased and job.attempt < MOST_ATTEMPTS + job.halvings:
             part.stop, part.given_up = self._row, True
             part.notes = ("given up because samples are missing; repeated",)
             self.left = [job.again(halved=False), *following]
             return True
-        if not one.biased and done + one.periods <= most:
+        if done < most and not one.biased:
             return False
+        tried = f"{job.attempt} attempts" if one.biased else f"{most}"
         self.verdict = NotEnoughDataError(
             f"experiment {one.name}: {one.periods} whole periods of {one.period:.3g} s without a "
-            f"missing sample were not to be had in {most}. All axes were stopped, and the raw data are "
+            f"missing sample were not to be had in {tried}. All axes were stopped, and the raw data are "
             "kept. Check the bus (cables, terminators, load) and the computer's load, or plan shorter "
             "periods."
         )
@@ -343,6 +386,17 @@ class ExperimentStream:
             if voice.over is None or self._row - begin < voice.over
         ] + self._voices[-1:]
         return Targets(position, offset) if self._with_torque else position
+
+
+def _both(*notes: str) -> str:
+    return "; ".join(note for note in notes if note)
+
+
+def _origin(chosen: IntArray) -> str:
+    """Say of which of the measured periods the rows of whole ones are, shape (periods, samples)."""
+    passes, counts = np.unique(chosen, return_counts=True)
+    parts = (f"{n} of period {k + 1}" for k, n in zip(passes, counts, strict=True))
+    return f"whole periods of undisturbed rows: {', '.join(parts)}"
 
 
 def _evenly(rows: int, block: int) -> list[int]:

@@ -37,9 +37,9 @@ ASKED, MARGIN = 4, 8
 of a trial, and the last ones, which are compared when later ones are known."""
 MOVED = 3
 """Times that a move is made at most, where cycles were late or frames were lost."""
-MOST_LATE, MOST_LATE_CYCLES = 0.02, 2.0
+MOST_LATE, MOST_LATE_CYCLES = 0.01, 1.0
 """Seconds, and cycles, by which a cycle of a move may begin late.  An axis whose targets stand still for
-longer stands there: it would be told to go on at full speed."""
+longer is told to go on at full speed: better a quick stop than the swing that this makes."""
 NO_PROBE: FloatArray = np.zeros(0)
 
 

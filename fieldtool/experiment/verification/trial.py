@@ -177,7 +177,7 @@ def run_trial(
         sags=may_sag,
     )
     brakes = None if fed is None else Brakes(fed, trial.cycle_time)
-    watch = TrialWatch(axes.names, swings, guards, brakes)
+    watch = TrialWatch(axes.names, swings, guards, brakes, trial.cycle_time)
     rests: list[Capture] = []
     kept: list[Experiment] = []
 

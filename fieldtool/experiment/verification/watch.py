@@ -1,7 +1,7 @@
 """All that watches a trial in every cycle, behind one door: swings, the controllers, the work."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -10,6 +10,10 @@ from fieldtool.experiment.verification.brakes import Brakes
 from fieldtool.experiment.verification.identity import IdentityWatch
 from fieldtool.experiment.verification.oscillation import OscillationWatch
 from fieldtool.experiment.verification.work import WorkRecord, WorkWatch
+
+DISTURBS, DISTURBED = 0.25, 0.5
+"""Share of a cycle by which one of moving targets may begin late and disturb nothing; seconds in which
+an axis may swing for a later one.  Its reference stands, and then goes on at full speed."""
 
 
 @dataclass(frozen=True)
@@ -26,6 +30,7 @@ class TrialWatch:
     """Lets each of the watches look at every cycle; a ``drives.api.MotionWatch``.
 
     ``brakes`` leaves out of the torques that may swing what drives do at late SYNCs; None: nobody does.
+    ``cycle_time`` in s.
     """
 
     def __init__(
@@ -34,10 +39,13 @@ class TrialWatch:
         swings: OscillationWatch,
         guards: Guards,
         brakes: Brakes | None = None,
+        cycle_time: float = 0.0,
     ) -> None:
         self._names, self.swings, self._guards = tuple(names), swings, guards
-        self._brakes = brakes
+        self._brakes, self._step = brakes, cycle_time
         self._small = True
+        self._target: list[float] | None = None
+        self._held_up, self._since = 0.0, 0
         self.most_late = np.inf
         """Seconds by which the present cycle may begin late where targets move."""
 
@@ -49,6 +57,7 @@ class TrialWatch:
     def begin(self) -> None:
         """Another motion begins: its axes stand still where they are first seen."""
         self.swings.begin()
+        self._target, self._held_up = None, 0.0
         if self._brakes is not None:
             self._brakes.begin()
         self._small = True
@@ -96,9 +105,10 @@ class TrialWatch:
     ) -> Alarm | None:
         """Take one cycle; see ``drives.api.MotionWatch``."""
         smooth = torque if self._brakes is None else self._brakes.take(torque, target, late)
+        self._note_late(target, late)
         alarm = self.swings.take(position, torque, smooth)
         if alarm is not None:
-            return alarm
+            return replace(alarm, held_up=self._held_up)
         found: list[tuple[int, str]] = []
         guards = self._guards
         seen: tuple[Sequence[float], Sequence[float]] | None = position, torque
@@ -118,3 +128,13 @@ class TrialWatch:
             self._names[k],
             frozenset(self._names[j] for j, _ in found),
         )
+
+    def _note_late(self, target: Sequence[float], late: float) -> None:
+        """Remember for DISTURBED by how much a cycle of moving targets was late."""
+        moves = self._target is not None and list(target) != self._target
+        self._target = list(target)
+        self._since += 1
+        if self._since * self._step > DISTURBED:
+            self._held_up = 0.0
+        if moves and late > DISTURBS * self._step:
+            self._held_up, self._since = max(late, self._held_up), 0

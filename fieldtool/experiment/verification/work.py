@@ -15,7 +15,8 @@ is known from a trial before, may be off by some of its own steps and UNSURE of 
 while targets move, positions may be a cycle older than torques, or motors a cycle late.  What moves
 when it is first seen brings its motion along, twice what the model's masses make of it.  Dry
 friction may have held any part of itself in the torque at rest: work stays above zero all the same.
-Valid while gravity is as it was at rest: for small motions.
+Valid while gravity is as it was at rest: for small motions.  After a sample that is missing while
+targets move nothing is said until all stand again: nobody knows what springs and masses have taken up.
 """
 
 from collections.abc import Sequence
@@ -43,18 +44,22 @@ class WorkRecord:
 
     def __init__(self) -> None:
         self._parts: list[tuple[bool, list[tuple[Sequence[float], Sequence[float]]]]] = []
+        self._lost = False
 
     def begin(self, *, moves: bool = False) -> None:
         """All axes stand; what they did before is a part of its own."""
         self._parts.append((moves, []))
+        self._lost = False
 
     def take(
         self, position: Sequence[float], torque: Sequence[float], *, fresh: bool
     ) -> list[tuple[int, str]]:
         """Take one SYNC of all axes; nothing is said of it."""
         if not fresh or not self._parts:
-            self.begin(moves=bool(self._parts) and self._parts[-1][0])
-        if fresh:
+            moves = bool(self._parts) and self._parts[-1][0]
+            self.begin(moves=moves)
+            self._lost = moves
+        if fresh and not self._lost:
             self._parts[-1][1].append((position, torque))
         return []
 
@@ -113,7 +118,7 @@ class WorkWatch:
 
         ``moves`` says whether the targets move from now on.
         """
-        self._moves = moves
+        self._moves, self._lost = moves, False
         m = self._rest.size
         self.missing = 0.0
         """Work that is missing, over what may be by rounding and by the torque at rest."""
@@ -127,6 +132,8 @@ class WorkWatch:
         """Take one SYNC of all axes; return the one whose work is most negative, where there is such."""
         if not fresh:
             self.begin(moves=self._moves)
+            self._lost = self._moves
+        if not fresh or self._lost:
             return []
         at, beside = np.array(position), np.array(torque) - self._rest
         if self._start is None:
