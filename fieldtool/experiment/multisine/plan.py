@@ -45,6 +45,8 @@ class MultisineExperiment:
     """Cycles of excitation before them."""
     bias: FloatArray
     """Constant velocity added to each reference, (M,), rad/s or m/s."""
+    tail: int = 0
+    """Cycles after a late one that it disturbs; 0: as many as the run-in has."""
 
     def __post_init__(self) -> None:
         fault = self._fault()

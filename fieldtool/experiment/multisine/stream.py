@@ -82,12 +82,9 @@ class _Part:
     """Rows, from its beginning."""
 
     def sound(self, passes: int) -> BoolArray:
-        """Return which rows of so many passes are undisturbed, (passes, samples).
-
-        What a disturbance leaves swings for a period of the lowest line, as long as a fade-in takes.
-        """
+        """Return which rows of so many passes are undisturbed, (passes, samples)."""
         one = self.job.experiment
-        tail = min(int(np.ceil(one.samples / one.lines[0])), one.settle)
+        tail = one.tail or one.settle
         return sound_rows(self.missing, tail, one.settle, one.samples, passes)
 
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from fieldtool.errors import PlanRefusedError
 from fieldtool.experiment.axes import torque_limits
 from fieldtool.experiment.forecast import Setting
+from fieldtool.experiment.multisine.design import settle_time
 from fieldtool.experiment.multisine.excitation import signals
 from fieldtool.experiment.multisine.forecast import (
     experiment_peaks,
@@ -102,6 +103,7 @@ def sensitivity_plan(
         periods=2 if period < LONGEST / 2 else 1,
         settle=samples,
         bias=np.zeros(len(peaks)),
+        tail=round(settle_time(settings[0].model) / cycle_time),
     )
     plan = MultisinePlan(cycle_time, (experiment,))
     scaled = [_scaled(plan, setting) for setting in settings]
