@@ -126,18 +126,19 @@ class Verification:
             wait_for_standstill(self._group)
         except PlanRefusedError as error:
             raise PlanRefusedError(f"{error} Nothing was moved or written.") from None
-        self._plan = plan = self._plan_here()
+        self._plan = self._plan_here()
+        return self._plan
+
+    def _plan_here(self) -> TrialPlan:
+        designed = self._tuning.prediction if self._believed else None
+        plan = plan_trial(
+            self._group, self._setting, self._changes, self._bound, self._stated, designed
+        )
         if self._believed and self._tuning.response != SOFTEST:
             check_no_worse(plan.before, plan.after, plan.trial.cycle_time)
         for note in plan.notes:
             self._session.warn(note)
         return plan
-
-    def _plan_here(self) -> TrialPlan:
-        designed = self._tuning.prediction if self._believed else None
-        return plan_trial(
-            self._group, self._setting, self._changes, self._bound, self._stated, designed
-        )
 
     def before(self) -> None:
         """Try the parameters that are in the drives.
@@ -236,7 +237,7 @@ class Verification:
                         f"Shortly before, this computer was {1000 * error.held_up:.0f} ms late in the "
                         "move: that alone may have done it"
                     )
-                    if not left or name != "before":
+                    if label != "before":  # once is enough: the loops may swing by themselves
                         error.add_note(f"{why}. Close other programs, and write again.")
                 if not left or not error.held_up or hasattr(error, "__notes__"):
                     raise
@@ -271,8 +272,8 @@ class Verification:
                     return text
                 try:
                     self._plan = self._plan_here()
-                except PlanRefusedError:
-                    return text
+                except PlanRefusedError as error:
+                    return f"{text} {error}"
                 self._session.screen.say(_what_moves(self._plan, self._axes))
             now = [drive.read_position() for drive in self._group.drives]
         except UserStopError:

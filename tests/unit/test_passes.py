@@ -1,10 +1,11 @@
 """Whole periods out of disturbed ones: every row undisturbed, and no row twice."""
 
 import numpy as np
+import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from fieldtool.experiment.multisine.passes import sound_rows, whole_periods
+from fieldtool.experiment.multisine.passes import sound_in_a_row, sound_rows, whole_periods
 
 
 @given(
@@ -12,7 +13,7 @@ from fieldtool.experiment.multisine.passes import sound_rows, whole_periods
     samples=st.integers(4, 40),
     passes=st.integers(1, 8),
     tail=st.integers(0, 60),
-    missing=st.lists(st.integers(0, 340), max_size=12),
+    missing=st.lists(st.integers(-80, 340), max_size=12),
 )
 def test_a_row_is_sound_if_nothing_came_shortly_before(settle, samples, passes, tail, missing):
     sound = sound_rows(missing, tail, settle, samples, passes)
@@ -29,24 +30,51 @@ def test_a_row_is_sound_if_nothing_came_shortly_before(settle, samples, passes, 
     share=st.floats(0.0, 0.5),
     seed=st.integers(0, 2**31),
 )
-def test_whole_periods_are_sound_and_no_row_is_in_two(samples, periods, spare, share, seed):
+def test_whole_periods_are_passes_in_a_row_of_sound_rows(samples, periods, spare, share, seed):
     sound = np.random.default_rng(seed).random((periods + spare, samples)) >= share
     assume(sound.sum(axis=0).min() >= periods)
-    chosen = whole_periods(sound, periods)
-    assert chosen.shape == (periods, samples)
-    n = np.arange(samples)
-    assert np.all(sound[chosen, n])
-    for column in chosen.T:
-        assert np.unique(column).size == periods
-    if sound.all():
-        assert np.array_equal(chosen, np.tile(np.arange(spare, spare + periods)[:, None], samples))
+    whole = whole_periods(sound, periods)
+    assert whole.own.tolist() == list(
+        range(whole.first * samples, (whole.first + periods) * samples)
+    )
+    assert np.all(sound.ravel()[whole.sources])
+    assert np.unique(whole.sources).size == whole.sources.size, "no row twice"
+    assert np.array_equal(whole.sources % samples, whole.own % samples)
+    kept = sound.ravel()[whole.own]
+    assert np.array_equal(whole.sources[kept], whole.own[kept])
+    assert whole.lent == np.count_nonzero(~kept)
+    fewest = min(np.count_nonzero(~sound[k : k + periods]) for k in range(spare + 1))
+    assert whole.lent == fewest
+    if sound_in_a_row(sound, periods):
+        assert (whole.first, whole.lent) == (spare, 0)
 
 
 def test_only_what_is_disturbed_is_taken_from_elsewhere():
     sound = np.ones((4, 10), dtype=bool)
     sound[0, 2:5] = sound[2, 5:7] = False
-    assert whole_periods(sound, 3).tolist() == [
-        [1] * 10,
-        [2, 2, 2, 2, 2, 0, 0, 2, 2, 2],
-        [3] * 10,
-    ]
+    whole = whole_periods(sound, 3)
+    assert whole.first == 1
+    assert whole.sources.tolist() == [*range(10, 25), 5, 6, *range(27, 40)]
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.003])
+@pytest.mark.parametrize("late", [(1450,), (350, 1750), (350, 1750, 2900), (900, 1100, 2500, 3300)])
+def test_what_decays_or_drifts_goes_on_where_rows_are_of_another_pass(late, noise, fresh_rng):
+    """Of two periods; each late cycle throws the signals off for as long as rows count as disturbed."""
+    samples, passes, tail, step = 1000, 5, 200, 0.004
+    t = step * np.arange(samples * passes)[:, None]
+    phase = fresh_rng.uniform(0, 2 * np.pi, (8, 1, 2))
+    lines = np.arange(3, 19, 2)[:, None, None]
+    periodic = np.cos(2 * np.pi * lines * t / (samples * step) + phase).sum(axis=0)
+    slow = np.array([0.3, -0.2]) * np.exp(-t / 1.5) + np.array([0.05, 0.02]) * t
+    true = periodic + slow + noise * fresh_rng.standard_normal(periodic.shape)
+    seen = true.copy()
+    for row in late:
+        seen[row : row + tail + 1] += 1.0
+    sound = sound_rows(late, tail, 0, samples, passes)
+    whole = whole_periods(sound[: 2 + len(late)], 2)
+    filled = whole.filled(seen[: whole.sound.size])
+    off = np.abs(filled - true[whole.own])
+    assert off.max() < 0.02 + 8 * noise
+    as_they_are = np.abs(seen[whole.sources] - true[whole.own]).max()
+    assert as_they_are > 0.1 or not whole.lent

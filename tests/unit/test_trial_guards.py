@@ -41,7 +41,7 @@ GOOD = AxisLoop(30.0, 60.0 * INERTIA, 60.0 * 15.0 * INERTIA, 1.0, 0.9 * INERTIA)
 class Blind:
     """A watch for swings that sees none."""
 
-    trusts_loops = False
+    trusts_loops = strays = False
 
     def begin(self):
         """Nothing is kept."""
@@ -717,6 +717,10 @@ def test_an_alarm_says_whether_the_host_was_late_shortly_before(late, moves, aft
     swings.now = True
     alarm = watched.take([0.0], [0.0], target, [0.0], fresh=True, late=0.0)
     assert alarm.held_up == held_up
+    swings.strays = True
+    strayed = watched.take([0.0], [0.0], target, [0.0], fresh=True, late=0.0)
+    assert strayed.held_up == 0.0, "where an axis is has nothing to do with it"
+    swings.strays = False
     watched.begin()
     assert watched.take([0.0], [0.0], [0.0], [0.0], fresh=True, late=0.0).held_up == 0.0
 

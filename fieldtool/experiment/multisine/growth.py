@@ -27,8 +27,8 @@ ONE_FREQUENCY = 0.8
 """Share of its power about one frequency, once its growth is taken out: no mere noise."""
 AT_LEAST = 2
 """They are compared with all stretches before these, of which there have to be so many."""
-OUT_OF_THE_USUAL, LARGER_THAN_ALL = 4.0, 2.0
-"""The last one is larger by these than the median, and than the largest, of the stretches before."""
+OUT_OF_THE_USUAL, LARGER_THAN_MOST, MOST = 4.0, 2.0, 0.95
+"""The last one is larger by these than the median, and than this share, of the stretches before."""
 SHARE_OF_LIMIT = 0.25
 """And above this share of the limit."""
 UNEXPECTED = 3.0
@@ -67,6 +67,9 @@ class GrowthWatch:
         something repeats.
     cycle_time
         Seconds.
+    periods
+        So many there may be at most, for which there is room from the beginning (of memory that is not
+        used before it is written): to make room takes as long as several cycles.
     """
 
     def __init__(
@@ -77,6 +80,7 @@ class GrowthWatch:
         torque_limits: FloatArray,
         expected_errors: FloatArray | None,
         cycle_time: float,
+        periods: int = 4,
     ) -> None:
         self._samples, self._steady, self._step = samples, steady, cycle_time
         self._limits = np.concatenate([error_limits, torque_limits])
@@ -85,8 +89,8 @@ class GrowthWatch:
         if expected_errors is not None:
             predicted = UNEXPECTED * expected_errors / error_limits
             self._first_threshold[:M] = np.maximum(SHARE_OF_LIMIT, predicted)
-        self._seen = _Trail(2 * M, steady + 4 * samples)
-        self._odd = _Trail(2 * M, 3 * samples)
+        self._seen = _Trail(2 * M, steady + periods * samples)
+        self._odd = _Trail(2 * M, periods * samples)
         shortest = max(FEWEST_ROWS, round(SHORTEST / cycle_time))
         doublings = max(1, 1 + int(np.log2(max(1.0, LONGEST / cycle_time / shortest))))
         self._lengths = [shortest << k for k in range(doublings)]
@@ -167,7 +171,7 @@ class _Trail:
                 return np.zeros_like(grown)
             before = self.levels(length, RISES + 1, count)
             grown &= level[-1] > OUT_OF_THE_USUAL * np.median(before, axis=0)
-            grown &= level[-1] > LARGER_THAN_ALL * before.max(axis=0)
+            grown &= level[-1] > LARGER_THAN_MOST * np.quantile(before, MOST, axis=0)
         for signal in np.flatnonzero(grown):
             evened = self._evened(int(signal), length)
             grown[signal] = _turns(evened) >= TURNS and _main(evened)[1] >= ONE_FREQUENCY

@@ -46,7 +46,7 @@ class MultisineExperiment:
     bias: FloatArray
     """Constant velocity added to each reference, (M,), rad/s or m/s."""
     tail: int = 0
-    """Cycles after a late one that it disturbs; 0: as many as the run-in has."""
+    """Cycles after a late one that it disturbs; 0: as long as the run-in tells."""
 
     def __post_init__(self) -> None:
         fault = self._fault()

@@ -20,6 +20,8 @@ from fieldtool.experiment.multisine.passes import (
     AS_IT_CAME,
     BoolArray,
     IntArray,
+    Whole,
+    sound_in_a_row,
     sound_rows,
     whole_periods,
 )
@@ -32,10 +34,13 @@ BLOCK_TIME = 0.25
 HALVINGS = 4
 """Times that an experiment's amplitude is halved before the axis counts as overloaded by something
 else."""
-MOST_PERIODS = 6
-"""Times the planned periods that an experiment goes on until all of them are whole."""
+PREFERRED, MOST_PERIODS = 2, 6
+"""Times the planned periods that an experiment goes on for sound ones in a row, and until every row of
+all of them was sound."""
 MOST_ATTEMPTS = 3
 """Times that an experiment is begun which can not go on: with a bias velocity there is no room."""
+TAIL = 2
+"""Times its run-in that a late cycle disturbs an experiment: a period of the lowest line as a rule."""
 STOP_TIME, STOP_SHARE = 0.25, 0.5
 """An unstable loop's excitation ends in so many seconds at least, and with this share of the velocity
 and acceleration limits."""
@@ -81,11 +86,15 @@ class _Part:
     missing: list[int] = field(default_factory=list)
     """Rows, from its beginning."""
 
+    @property
+    def tail(self) -> int:
+        """Rows after a missing one that it disturbs."""
+        return self.job.experiment.tail or TAIL * self.job.experiment.settle
+
     def sound(self, passes: int) -> BoolArray:
         """Return which rows of so many passes are undisturbed, (passes, samples)."""
         one = self.job.experiment
-        tail = one.tail or one.settle
-        return sound_rows(self.missing, tail, one.settle, one.samples, passes)
+        return sound_rows(self.missing, self.tail, one.settle, one.samples, passes)
 
 
 class ExperimentStream:
@@ -131,7 +140,8 @@ class ExperimentStream:
     def _recorded(self, part: _Part, capture: Capture, cut: str) -> Iterator[Experiment]:
         """Yield an experiment; where it had to go on, as it came, and its whole periods.
 
-        These have the rows of the run-in and of the planned periods, as without a disturbance.
+        These have as many rows as without a disturbance: the last ones before them, as they came, stand
+        for the run-in.
         """
         one = part.job.experiment
         rows = np.arange(part.begin, min(part.stop or capture.rows, capture.rows))
@@ -142,16 +152,21 @@ class ExperimentStream:
         if not part.complete or passes == one.periods:
             yield every
             return
-        chosen = whole_periods(part.sound(passes), one.periods)
-        sources = one.settle + chosen * one.samples + np.arange(one.samples)
-        whole = np.concatenate([np.arange(one.settle), sources.ravel()])
-        mended = self._experiment(part, capture, rows[whole], cut)
+        whole = whole_periods(part.sound(passes), one.periods)
+        begin = whole.first * one.samples
+        taken = rows[begin : begin + one.rows]
+        mended = self._experiment(part, capture, taken, cut)
+        position, torque = (
+            np.concatenate([values[taken[: one.settle]], whole.filled(values[rows[one.settle :]])])
+            for values in (capture.position, capture.torque)
+        )
         name = one.name + AS_IT_CAME
         why = f"{passes - one.periods} periods more, because cycles were late or samples missing"
         yield replace(
             every, name=name, kind="other", period=None, complete=False, note=_both(every.note, why)
         )
-        yield replace(mended, note=_both(mended.note, _origin(chosen)))
+        note = _both(mended.note, _origin(whole, one.periods))
+        yield replace(mended, position=position, torque=torque, note=note)
 
     def _experiment(self, part: _Part, capture: Capture, rows: IntArray, cut: str) -> Experiment:
         job, one, names = part.job, part.job.experiment, self._axes.names
@@ -208,14 +223,18 @@ class ExperimentStream:
         """Run one experiment; return whether it is complete."""
         one = job.experiment
         part = _Part(job, self._row)
+        if self._parts:  # what was disturbed shortly before is so still
+            earlier = self._parts[-1]
+            before = [row + earlier.begin - part.begin for row in earlier.missing]
+            part.missing += [row for row in before if row >= -part.tail]
         self._parts.append(part)
         self._watch, self._watched = self._watch_of(job), self._row
         clean = 0
         later = self._rows_of(following) + one.fade
         for stage, rows in enumerate(chain([one.settle], repeat(one.samples))):
-            left = later + (one.periods - clean) * one.samples
+            left = later + max(one.periods - clean, 1) * one.samples
             left += one.settle if stage == 0 else 0
-            first = clean + 1 if stage else 0
+            first = min(clean + 1, one.periods) if stage else 0
             for n in _evenly(rows, self._block):
                 begin = self._row - part.begin
                 capture = yield self._targets(n)
@@ -226,11 +245,13 @@ class ExperimentStream:
                     return False
             if stage == 0:
                 continue
-            clean = int(part.sound(stage).sum(axis=0).min())
-            if clean == one.periods:
+            sound = part.sound(stage)
+            clean = min(int(sound.sum(axis=0).min()), one.periods)
+            in_a_row = sound_in_a_row(sound, one.periods)
+            if in_a_row or (clean == one.periods and stage >= PREFERRED * one.periods):
                 part.stop, part.complete = self._row, True
                 return True
-            if clean < stage and self._ends_for_gaps(part, stage, following):
+            if not sound.all() and self._ends_for_gaps(part, stage, following):
                 return False
         raise AssertionError("periods never end")
 
@@ -238,7 +259,9 @@ class ExperimentStream:
         one, limits = job.experiment, self._axes.limits
         errors = np.array([axis.following_error for axis in limits])
         torques = np.array([axis.torque for axis in limits])
-        return GrowthWatch(one.samples, one.fade, errors, torques, job.expected, self._step)
+        most = MOST_PERIODS * one.periods + 2  # with the run-in
+        rows = one.samples, one.fade
+        return GrowthWatch(*rows, errors, torques, job.expected, self._step, most)
 
     def _gives_up(self, part: _Part, capture: Capture, following: list[Job]) -> bool:
         """Judge a block; where the experiment can not go on, say how it ends."""
@@ -389,11 +412,13 @@ def _both(*notes: str) -> str:
     return "; ".join(note for note in notes if note)
 
 
-def _origin(chosen: IntArray) -> str:
-    """Say of which of the measured periods the rows of whole ones are, shape (periods, samples)."""
-    passes, counts = np.unique(chosen, return_counts=True)
-    parts = (f"{n} of period {k + 1}" for k, n in zip(passes, counts, strict=True))
-    return f"whole periods of undisturbed rows: {', '.join(parts)}"
+def _origin(whole: Whole, periods: int) -> str:
+    """Say which of the measured periods these are."""
+    first, last = whole.first + 1, whole.first + periods
+    which = f"period {first}" if first == last else f"periods {first} to {last}"
+    if not whole.lent:
+        return f"{which} of those that were measured"
+    return f"{which} of those that were measured, {whole.lent} disturbed rows as in the others"
 
 
 def _evenly(rows: int, block: int) -> list[int]:

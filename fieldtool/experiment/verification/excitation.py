@@ -22,6 +22,7 @@ from fieldtool.experiment.multisine.forecast import (
 )
 from fieldtool.experiment.multisine.phases import low_crest
 from fieldtool.experiment.multisine.plan import MultisineExperiment, MultisinePlan
+from fieldtool.experiment.multisine.stream import TAIL
 from fieldtool.records.closed_loop import ComplexArray
 from fieldtool.records.model import FloatArray
 
@@ -103,7 +104,7 @@ def sensitivity_plan(
         periods=2 if period < LONGEST / 2 else 1,
         settle=samples,
         bias=np.zeros(len(peaks)),
-        tail=round(settle_time(settings[0].model) / cycle_time),
+        tail=round(TAIL * settle_time(settings[0].model) / cycle_time),
     )
     plan = MultisinePlan(cycle_time, (experiment,))
     scaled = [_scaled(plan, setting) for setting in settings]

@@ -159,6 +159,8 @@ class OscillationWatch:
         self._allowed: Allowed | None = None
         self._since = 0
         self.alarm: Alarm | None = None
+        self.strays = False
+        """Whether an axis is not where it may be, by the last alarm."""
         """What ended the motion."""
 
     @property
@@ -357,6 +359,8 @@ class OscillationWatch:
         self._listen(torque)
         if not found:
             return None
+        ways = zip(allowed.low, position, allowed.high, strict=True)
+        self.strays = not all(low <= at <= high for low, at, high in ways)
         k, text = found[0]
         self.alarm = Alarm(
             f"{self._names[k]}: {text}; its power was cut and all axes were stopped.",

@@ -36,7 +36,7 @@ ASKED, MARGIN = 4, 8
 """Times that a first answer is asked for, at most; and cycles of it that may be missing: the first ones
 of a trial, and the last ones, which are compared when later ones are known."""
 MOVED = 3
-"""Times that a move is made at most, where cycles were late or frames were lost."""
+"""Times that a nudge or a move is made at most, where cycles were late or frames were lost."""
 MOST_LATE, MOST_LATE_CYCLES = 0.01, 1.0
 """Seconds, and cycles, by which a cycle of a move may begin late.  An axis whose targets stand still for
 longer is told to go on at full speed: better a quick stop than the swing that this makes."""
@@ -105,14 +105,14 @@ class Steps:
         torque = np.minimum(self._gentle_torque, move.torque)
         torque[k] = max(float(torque[k]), move.answer)
         low, high = self._ways(k, float(move.probe[np.argmax(np.abs(move.probe))]), 0.0)
-        self._watch.move(small=True)
-        self._watch.swings.move(
-            low, high, torque, PROBE_REST / 3, axis=k, shakes=SHAKES * move.answer
-        )
         path = np.concatenate([move.probe, np.zeros(round(PROBE_REST / step))])
         name = f"{self._name}: first answer of {self._axes.names[k]}"
         again = np.concatenate([np.zeros(round(REST_AGAIN / step)), path])
         for one in (path, *[again] * (ASKED - 1)):
+            self._watch.move(small=True)
+            self._watch.swings.move(
+                low, high, torque, PROBE_REST / 3, axis=k, shakes=SHAKES * move.answer
+            )
             self._stream(one, k, name, keep=False)
             if self._watch.saw(path.size - MARGIN):
                 break
@@ -124,6 +124,7 @@ class Steps:
     def nudge(self, move: TrialMove) -> None:
         """Go a little way and back; the axis has to go there, and no other may move.
 
+        Once more where samples are missing, for then nobody saw all that the motor did.
         Never faster than the move itself, which was planned to keep the axis' limits.
         """
         axes, k, step = self._axes, move.axis, self._motion.cycle_time
@@ -134,9 +135,12 @@ class Steps:
         path = np.concatenate([there, size * pause, size - there, 0 * pause])
         low, high = self._ways(k, size, BEYOND * abs(size))
         torque = np.minimum(self._gentle_torque, move.torque)
-        self._watch.move(small=True)
-        self._watch.swings.move(low, high, torque, NUDGE_TIME / 3, axis=k, gentle=True)
-        self._stream(path, move.axis, f"{self._name}: nudge of {axes.names[k]}", keep=False)
+        for _ in range(MOVED):
+            self._watch.move(small=True)
+            self._watch.swings.move(low, high, torque, NUDGE_TIME / 3, axis=k, gentle=True)
+            name = f"{self._name}: nudge of {axes.names[k]}"
+            if not self._stream(path, move.axis, name, keep=False).missing:
+                break
 
     def move(self, move: TrialMove) -> None:
         """Go the whole way, rest, come back, rest; once more where samples are missing."""

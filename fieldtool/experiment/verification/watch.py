@@ -11,9 +11,10 @@ from fieldtool.experiment.verification.identity import IdentityWatch
 from fieldtool.experiment.verification.oscillation import OscillationWatch
 from fieldtool.experiment.verification.work import WorkRecord, WorkWatch
 
-DISTURBS, DISTURBED = 0.25, 0.5
-"""Share of a cycle by which one of moving targets may begin late and disturb nothing; seconds in which
-an axis may swing for a later one.  Its reference stands, and then goes on at full speed."""
+DISTURBS, DISTURBS_LEAST, DISTURBED = 0.25, 0.002, 0.5
+"""Share of a cycle, and seconds, by which one of moving targets may begin late and disturb nothing;
+seconds in which an axis may swing for a later one.  Its reference stands, and then goes on at full
+speed."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +109,8 @@ class TrialWatch:
         self._note_late(target, late)
         alarm = self.swings.take(position, torque, smooth)
         if alarm is not None:
-            return replace(alarm, held_up=self._held_up)
+            # what is not where it may be is no matter of being late
+            return alarm if self.swings.strays else replace(alarm, held_up=self._held_up)
         found: list[tuple[int, str]] = []
         guards = self._guards
         seen: tuple[Sequence[float], Sequence[float]] | None = position, torque
@@ -136,5 +138,5 @@ class TrialWatch:
         self._since += 1
         if self._since * self._step > DISTURBED:
             self._held_up = 0.0
-        if moves and late > DISTURBS * self._step:
+        if moves and late > max(DISTURBS * self._step, DISTURBS_LEAST):
             self._held_up, self._since = max(late, self._held_up), 0
