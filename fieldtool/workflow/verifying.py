@@ -35,6 +35,7 @@ from fieldtool.errors import (
 )
 from fieldtool.experiment.axes import Axes, torque_limits
 from fieldtool.experiment.verification.oscillation import HOLD_LEVEL, LOUDEST
+from fieldtool.experiment.verification.steps import nudge_size
 from fieldtool.experiment.verification.trial import Tried, run_trial, still_allowed
 from fieldtool.records.model import FloatArray, MachineModel
 from fieldtool.records.recording import Experiment, RecordingWriter
@@ -257,7 +258,7 @@ class Verification:
 
         The old parameters' trial begins from anywhere, by other moves where there is no room for those
         that were planned, and learns anew.  With the new ones it is compared with torques at rest that
-        are known where the old one began.
+        are known where the old one began, and as far from there as a nudge goes.
 
         Raises
         ------
@@ -283,7 +284,9 @@ class Verification:
         self._heed_stop()
         if name == "before":
             return ""
-        far = np.abs(np.subtract(now, began)) > still_allowed(self._axes)
+        ways = {move.axis: nudge_size(move, self._axes) for move in self._planned.trial.moves}
+        nudges = [abs(ways.get(k, 0.0)) for k in range(len(now))]
+        far = np.abs(np.subtract(now, began)) > still_allowed(self._axes) + nudges
         away = [axis for axis, is_far in zip(self._axes.names, far, strict=True) if is_far]
         return f"{', '.join(away)} is not where it began. Write again." if away else ""
 

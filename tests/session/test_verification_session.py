@@ -819,13 +819,13 @@ MIDDLE = 8
 class StandsStill:
     """The host stands still in the middle of the first moves of so many trials, after some others."""
 
-    def __init__(self, bench, monkeypatch, seconds, trials, after, at=MIDDLE):
+    def __init__(self, bench, monkeypatch, seconds, trials, after, at=MIDDLE, what="move"):
         self.left, self.begun = trials, 0
         stream, cut = Steps._stream, steps.slices
 
         def noted(one, path, k, name, **more):
             self.clock = one._motion._line.clock
-            self.now = "move of table" in name
+            self.now = f"{what} of table" in name
             self.begun += self.now
             return stream(one, path, k, name, **more)
 
@@ -936,6 +936,17 @@ def test_after_a_swing_new_loops_are_not_tried_again_however_late_the_host_was(
     assert late.begun == 2
     assert patient.powered() == {}
     assert patient.changed() == {}
+
+
+def test_new_parameters_are_tried_again_within_a_nudge_of_where_they_began(patient, monkeypatch):
+    late = StandsStill(patient, monkeypatch, 0.14, 1, 1, at=3, what="nudge")
+    outcome = write(patient)
+    assert outcome.code == 0, outcome.err
+    assert "the trial is begun again, 2 times at most" in " ".join(outcome.out.split())
+    assert late.begun == 3
+    cut = [e for e in load(patient.out / "verification.h5").experiments if not e.complete]
+    assert [e.name for e in cut] == ["after: nudge of table"]
+    assert verification(patient)["verdict"] == "verified"
 
 
 def planned_again(monkeypatch, again):

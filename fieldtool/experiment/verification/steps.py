@@ -128,8 +128,7 @@ class Steps:
         Never faster than the move itself, which was planned to keep the axis' limits.
         """
         axes, k, step = self._axes, move.axis, self._motion.cycle_time
-        size = max(NUDGE_SHARE * abs(move.distance), NUDGE_COUNTS * float(axes.counts[k]))
-        size = float(np.copysign(min(size, abs(move.distance)), move.distance))
+        size = nudge_size(move, axes)
         there = smooth_move(size, *_pace(move, axes.limits[k], step), step, NUDGE_TIME)
         pause = np.full(max(2, round(NUDGE_TIME / step)), 1.0)
         path = np.concatenate([there, size * pause, size - there, 0 * pause])
@@ -230,6 +229,12 @@ class Steps:
     def _experiment(self, capture: Capture, k: int, name: str, note: str = "") -> Experiment:
         driven = (self._axes.names[k],)
         return recorded(capture, driven, name, self._motion.cycle_time, note)
+
+
+def nudge_size(move: TrialMove, axes: Axes) -> float:
+    """Return how far a nudge goes, with the move's sign, rad or m."""
+    size = max(NUDGE_SHARE * abs(move.distance), NUDGE_COUNTS * float(axes.counts[move.axis]))
+    return float(np.copysign(min(size, abs(move.distance)), move.distance))
 
 
 def _pace(move: TrialMove, limits: AxisLimits, cycle: float) -> tuple[float, float]:
