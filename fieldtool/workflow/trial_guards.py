@@ -40,6 +40,8 @@ class TrialGuards:
     ) -> None:
         self._group, self._axes, self._step, self._warn = group, axes, cycle_time, warn
         self._works = WorkRecord()
+        self.missing = np.inf
+        """Work that was missing with the old parameters, over what is usual; infinite: not known yet."""
         self._identity: IdentityWatch | None = None
         self._learned: Learned | None = None
 
@@ -65,7 +67,7 @@ class TrialGuards:
         limits = torque_limits(axes.limits)
         inertia = np.zeros(limits.size) if axes.inertia is None else axes.inertia
         known = old.rest, axes.counts, limits, quanta, inertia / self._step**2, axes.units
-        missing = self._works.most(WorkWatch(*known, unsure=old.unsure))
+        self.missing = missing = self._works.most(WorkWatch(*known, unsure=old.unsure))
         if missing > MOST_MISSING:
             self._warn(
                 "whether motors push the way that they are asked to is hardly told: with the old "

@@ -66,6 +66,9 @@ from fieldtool.writeback.temporary import backed_up
 
 TRIALS = 3
 """Times that a trial is begun at most, where this computer was late in a move."""
+WEIGHTLESS = 1 / 3
+"""Share of the work that may be missing in a nudge, below which torques at rest are as good a nudge
+farther on: from there a nudge misses three times as much by a weight as from where it was known."""
 LOUDER = 1.5
 """Times its swing with the old parameters by which a torque may swing at rest."""
 
@@ -225,30 +228,30 @@ class Verification:
 
         That is no word on the loops.  All drives are disabled in between, and nothing begins anew that
         a person stopped, that left anything to be said, or that may have changed what is known; nor
-        anything with new parameters after an alarm, whatever may have made it.
+        anything after an alarm, whatever may have made it, but the old parameters' trial once.
         """
         began = [drive.read_position() for drive in self._group.drives]
+        swung = name != "before"
         for left, label in zip(reversed(range(TRIALS)), _labels(name), strict=True):
             try:
                 return self._try(name, label, keep, trusts_loops=trusts_loops)
             except SafetyStopError as error:
-                why = "That says nothing of the loops"
+                times = f"{left} time{'s' if left > 1 else ''} at most"
+                why = f"That says nothing of the loops: the trial is begun again, {times}"
                 if isinstance(error, OscillationError) and error.held_up:
-                    why = (
+                    late = (
                         f"Shortly before, this computer was {1000 * error.held_up:.0f} ms late in the "
                         "move: that alone may have done it"
                     )
-                    if label != "before":  # once is enough: the loops may swing by themselves
-                        error.add_note(f"{why}. Close other programs, and write again.")
+                    if swung:  # the loops may swing by themselves
+                        error.add_note(f"{late}. Close other programs, and write again.")
+                    swung, why = True, f"{late}, and the trial is begun again"
                 if not left or not error.held_up or hasattr(error, "__notes__"):
                     raise
                 if blocked := self._blocked(began, name):
                     error.add_note(f"The trial could not be begun again: {blocked}")
                     raise
-                self._session.warn(
-                    f"{error} {why}: the trial is begun again, {left} time{'s' if left > 1 else ''} at "
-                    "most."
-                )
+                self._session.warn(f"{error} {why}.")
                 if name == "before":
                     self._guards = None  # it begins where the axes stand now, and learns anew
         raise AssertionError("the last trial ends or raises")
@@ -258,7 +261,7 @@ class Verification:
 
         The old parameters' trial begins from anywhere, by other moves where there is no room for those
         that were planned, and learns anew.  With the new ones it is compared with torques at rest that
-        are known where the old one began, and as far from there as a nudge goes.
+        are known where the old one began, and where no weight shows as far from there as a nudge goes.
 
         Raises
         ------
@@ -285,7 +288,8 @@ class Verification:
         if name == "before":
             return ""
         ways = {move.axis: nudge_size(move, self._axes) for move in self._planned.trial.moves}
-        nudges = [abs(ways.get(k, 0.0)) for k in range(len(now))]
+        weightless = self._guards is not None and self._guards.missing < WEIGHTLESS
+        nudges = [weightless * abs(ways.get(k, 0.0)) for k in range(len(now))]
         far = np.abs(np.subtract(now, began)) > still_allowed(self._axes) + nudges
         away = [axis for axis, is_far in zip(self._axes.names, far, strict=True) if is_far]
         return f"{', '.join(away)} is not where it began. Write again." if away else ""

@@ -273,6 +273,10 @@ def test_what_a_late_cycle_spoils_is_measured_again(missing: tuple[int, ...], mo
     assert whole.name == "multisine 1"
     assert whole.complete
     assert whole.samples == SETTLE + 3 * SAMPLES
+    jolts = [
+        np.abs(np.diff(one.position[SETTLE // 2 :], 2, axis=0)).max() for one in (whole, plain)
+    ]
+    assert not more or jolts[0] < 1.05 * jolts[1] + 4e-4, "nor in what stands for its run-in"
     assert kept[-1].name == "multisine 2"
     np.testing.assert_allclose(last_rows(whole), last_rows(plain), atol=2e-4)
     np.testing.assert_allclose(

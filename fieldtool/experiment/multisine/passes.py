@@ -21,8 +21,9 @@ BoolArray = NDArray[np.bool_]
 
 AS_IT_CAME = ", as it came"
 """Ends the name of a record with all its rows in their order, beside the periods taken out of it."""
-EDGE = 8
-"""Rows at each end of a disturbed stretch over which two passes are compared."""
+EDGE, EDGE_SHARE = 8, 0.25
+"""Rows at each end of a disturbed stretch over which two passes are compared, at least; and their share
+of its length."""
 
 
 def sound_rows(
@@ -55,12 +56,10 @@ def sound_in_a_row(sound: BoolArray, periods: int) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Whole:
-    """Passes in a row, with the row of the record that stands for each of theirs."""
+    """Passes in a row and a run-in before them, with the row of the record that stands for each."""
 
-    first: int
-    """Pass."""
     own: IntArray
-    """Their own rows, counted from the first pass' first, shape (periods * samples,)."""
+    """Their own rows, counted from the first pass' first, in a row; shape (n,)."""
     sources: IntArray
     """The same, but where they are disturbed rows of other passes."""
     sound: BoolArray
@@ -72,10 +71,11 @@ class Whole:
         return int(np.count_nonzero(self.sources != self.own))
 
     def filled(self, values: FloatArray) -> FloatArray:
-        """Return the passes' values, shape (periods * samples, M), with the disturbed ones replaced.
+        """Return the rows' values, shape (n, M), with the disturbed ones replaced.
 
         Values of another pass are moved by the difference of the two at both ends of the stretch, in
-        between by a straight line from one to the other.
+        between by a straight line from one to the other, to the nearest value that was ever told: a
+        drive tells whole steps.
 
         Parameters
         ----------
@@ -87,26 +87,34 @@ class Whole:
         ends = np.flatnonzero(np.diff(shift)) + 1
         for a, b in pairwise([0, *ends.tolist(), shift.size]):
             if shift[a]:
-                filled[a:b] += self._between(values, int(self.own[a]), b - a, int(shift[a]))
+                moved = self._between(values, int(self.own[a]), b - a, int(shift[a]))
+                for k, told in enumerate(values.T):
+                    filled[a:b, k] = _nearest(np.unique(told), filled[a:b, k] + moved[:, k])
         return filled
 
     def _between(self, values: FloatArray, begin: int, count: int, shift: int) -> FloatArray:
         """Return what a stretch of ``count`` rows is above its source, shape (count, M)."""
         rows = np.arange(max(0, -shift), min(self.sound.size, self.sound.size - shift))
         both = rows[self.sound[rows] & self.sound[rows + shift]]
-        sides = both[both < begin][-EDGE:], both[both >= begin + count][:EDGE]
+        edge = max(EDGE, int(EDGE_SHARE * count))
+        sides = both[both < begin][-edge:], both[both >= begin + count][:edge]
         known = [side for side in sides if side.size]
         if not known:
             return np.zeros((count, values.shape[1]))
         above = [(values[side] - values[side + shift]).mean(axis=0) for side in known]
-        share = np.interp(
-            np.arange(begin, begin + count), [side.mean() for side in known], [0, 1][: len(known)]
-        )
+        centres, place = [side.mean() for side in known], np.arange(begin, begin + count)
+        share = np.interp(place, centres, np.arange(len(known)))
         moved: FloatArray = above[0] + share[:, None] * (above[-1] - above[0])
         return moved
 
 
-def whole_periods(sound: BoolArray, periods: int) -> Whole:
+def _nearest(levels: FloatArray, values: FloatArray) -> FloatArray:
+    """Return of rising levels those that values, shape (n,), are nearest to."""
+    found: FloatArray = levels[np.searchsorted((levels[1:] + levels[:-1]) / 2, values)]
+    return found
+
+
+def whole_periods(sound: BoolArray, periods: int, settle: int = 0) -> Whole:
     """Return ``periods`` passes in a row, as sound as can be, the later the better.
 
     Their disturbed rows are those of the nearest other passes that are sound there, no row twice.
@@ -117,17 +125,28 @@ def whole_periods(sound: BoolArray, periods: int) -> Whole:
         Of each pass, shape (passes, samples); every row sound in ``periods`` passes at least.
     periods
         How many are wanted.
+    settle
+        Rows before them that stand for their run-in, as far as there are passes before them.
     """
     passes, samples = sound.shape
     windows = [int(sound[k : k + periods].sum()) for k in range(passes - periods + 1)]
     first = max(range(len(windows)), key=lambda k: (windows[k], k))
-    own = np.arange(first * samples, (first + periods) * samples)
     inside = range(first, first + periods)
-    spare = sorted(set(range(passes)) - set(inside), key=lambda k: min(abs(k - i) for i in inside))
+    nearest = sorted(range(passes), key=lambda k: (min(abs(k - i) for i in inside), -k))
+    spare = [k for k in nearest if k not in inside]
+    begin = max(0, first * samples - settle)
+    own = np.arange(begin, (first + periods) * samples)
     sources = own.copy()
     for n in np.flatnonzero(~sound[inside].all(axis=0)).tolist():
         free = (k for k in spare if sound[k, n])
         for k in inside:
             if not sound[k, n]:
-                sources[(k - first) * samples + n] = next(free) * samples + n
-    return Whole(first, own, sources, sound.ravel())
+                sources[k * samples + n - begin] = next(free) * samples + n
+    flat = sound.ravel()
+    for row in range(
+        begin, first * samples
+    ):  # of the run-in: there may be none that is not used yet
+        if not flat[row]:
+            n = row % samples
+            sources[row - begin] = next(k for k in (*spare, *inside) if sound[k, n]) * samples + n
+    return Whole(own, sources, flat)

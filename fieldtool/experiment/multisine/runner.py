@@ -79,8 +79,9 @@ def run_multisine(
     keep
         Gets each experiment's raw data once the drives are off, also when it was cut short.  A
         complete one is the ``settle`` rows of its run-in, then ``periods * samples`` rows: whole
-        periods without a disturbed row.  Where it went on for longer to have them, all its rows in
-        their order come before it, of kind ``other``, and so is one that was given up, to be repeated.
+        periods without a disturbed row.  Where it went on for longer to have them, what came last
+        before them stands for the run-in, and all rows in their order come before it, of kind
+        ``other``.  One that was given up, to be repeated, is of that kind, too.
     report
         Called after every block.
     expected_errors

@@ -140,8 +140,7 @@ class ExperimentStream:
     def _recorded(self, part: _Part, capture: Capture, cut: str) -> Iterator[Experiment]:
         """Yield an experiment; where it had to go on, as it came, and its whole periods.
 
-        These have as many rows as without a disturbance: the last ones before them, as they came, stand
-        for the run-in.
+        These have as many rows as without a disturbance: the last ones before them stand for the run-in.
         """
         one = part.job.experiment
         rows = np.arange(part.begin, min(part.stop or capture.rows, capture.rows))
@@ -152,12 +151,12 @@ class ExperimentStream:
         if not part.complete or passes == one.periods:
             yield every
             return
-        whole = whole_periods(part.sound(passes), one.periods)
-        begin = whole.first * one.samples
-        taken = rows[begin : begin + one.rows]
+        whole = whole_periods(part.sound(passes), one.periods, one.settle)
+        end = one.settle + int(whole.own[-1]) + 1
+        taken, passed = rows[end - one.rows : end], rows[one.settle :]
         mended = self._experiment(part, capture, taken, cut)
         position, torque = (
-            np.concatenate([values[taken[: one.settle]], whole.filled(values[rows[one.settle :]])])
+            np.concatenate([values[taken[: -whole.own.size]], whole.filled(values[passed])])
             for values in (capture.position, capture.torque)
         )
         name = one.name + AS_IT_CAME
@@ -165,7 +164,7 @@ class ExperimentStream:
         yield replace(
             every, name=name, kind="other", period=None, complete=False, note=_both(every.note, why)
         )
-        note = _both(mended.note, _origin(whole, one.periods))
+        note = _both(mended.note, _origin(whole, one))
         yield replace(mended, position=position, torque=torque, note=note)
 
     def _experiment(self, part: _Part, capture: Capture, rows: IntArray, cut: str) -> Experiment:
@@ -412,9 +411,10 @@ def _both(*notes: str) -> str:
     return "; ".join(note for note in notes if note)
 
 
-def _origin(whole: Whole, periods: int) -> str:
+def _origin(whole: Whole, one: MultisineExperiment) -> str:
     """Say which of the measured periods these are."""
-    first, last = whole.first + 1, whole.first + periods
+    last = (int(whole.own[-1]) + 1) // one.samples
+    first = last - one.periods + 1
     which = f"period {first}" if first == last else f"periods {first} to {last}"
     if not whole.lent:
         return f"{which} of those that were measured"

@@ -158,9 +158,9 @@ class OscillationWatch:
         self._rest: list[float] = []
         self._allowed: Allowed | None = None
         self._since = 0
-        self.alarm: Alarm | None = None
         self.strays = False
         """Whether an axis is not where it may be, by the last alarm."""
+        self.alarm: Alarm | None = None
         """What ended the motion."""
 
     @property
