@@ -208,9 +208,9 @@ def up_again() -> Iterator[None]:
         link(name, "up")
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture
 def simulator(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Process]:
-    """``fieldtool simulate`` on vcan0."""
+    """``fieldtool simulate`` on vcan0, for each test anew: an axis whose power was cut coasts away."""
     from fieldtool.cli.main import main
 
     process = Process(

@@ -74,7 +74,7 @@ def test_random_machines_come_apart_within_1e6_and_within_their_bounds(axes, rng
 
 def test_chains_of_six_masses(rng):
     worst = []
-    for _ in range(3):
+    for _ in range(12):  # one in twenty is so ill-conditioned that its error is above
         model = exact_modes.random_machine(rng, 2, [6, 6])
         errors, bounds, _, _ = bench.errors_and_bounds(model)
         assert np.all(errors <= bounds)

@@ -65,6 +65,7 @@ def test_a_mode_above_the_band_is_found(fresh_rng):
 
 
 def test_a_chain_alone_keeps_nothing_beside_it(fresh_rng):
-    kept = [fitted(measured(fresh_rng))[1] for _ in range(4)]
-    assert sum(one.spring is not None for one in kept) <= 1
-    assert sum(one.upper_mode is not None for one in kept) <= 1
+    """By chance one in twenty keeps a spring: nine of forty do in two of ten thousand such tests."""
+    kept = [fitted(measured(fresh_rng))[1] for _ in range(40)]
+    assert sum(one.spring is not None for one in kept) <= 8
+    assert sum(one.upper_mode is not None for one in kept) <= 3
