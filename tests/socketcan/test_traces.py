@@ -41,7 +41,14 @@ def test_a_motion_is_traced_rebuilt_and_done_again(drives, listener, tmp_path, s
         (m.arbitration_id, bytes(m.data)) for m in listener.heard(0.5) if m.arbitration_id in known
     ]
     traced = [(m.arbitration_id, bytes(m.data)) for m in frames if m.arbitration_id in known]
-    assert traced == heard, "what another socket hears, in the order in which it was"
+    if sync == "host":
+        assert traced == heard, "what another socket hears, in the order in which it was"
+    else:  # the kernel's SYNC may come between what the host hands over and writes down
+        for ids in (known[:3], known[3:]):  # received, sent
+            of = [[one for one in every if one[0] in ids] for every in (traced, heard)]
+            assert of[0] == of[1], (
+                "what another socket hears, each way in the order in which it was"
+            )
     assert {m.is_rx for m in frames if m.arbitration_id == 0x80} == {False}
 
     decoder = Decoder(knowledge((axis, profile_of(axis, machine)) for axis in machine.axes))
