@@ -14,9 +14,9 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from fieldtool.experiment.multisine.excitation import IntArray
 from fieldtool.records.model import FloatArray
 
-IntArray = NDArray[np.int_]
 BoolArray = NDArray[np.bool_]
 
 AS_IT_CAME = ", as it came"
@@ -74,8 +74,7 @@ class Whole:
         """Return the rows' values, shape (n, M), with the disturbed ones replaced.
 
         Values of another pass are moved by the difference of the two at both ends of the stretch, in
-        between by a straight line from one to the other, to the nearest value that was ever told: a
-        drive tells whole steps.
+        between by a straight line from one to the other, in whole steps: a drive tells no others.
 
         Parameters
         ----------
@@ -109,9 +108,13 @@ class Whole:
 
 
 def _nearest(levels: FloatArray, values: FloatArray) -> FloatArray:
-    """Return of rising levels those that values, shape (n,), are nearest to."""
-    found: FloatArray = levels[np.searchsorted((levels[1:] + levels[:-1]) / 2, values)]
-    return found
+    """Return values, shape (n,), in whole steps from the nearest of the rising levels."""
+    if levels.size < 2:
+        return values
+    step = float(np.diff(levels).min())
+    found = levels[np.searchsorted((levels[1:] + levels[:-1]) / 2, values)]
+    whole: FloatArray = found + np.round((values - found) / step) * step
+    return whole
 
 
 def whole_periods(sound: BoolArray, periods: int, settle: int = 0) -> Whole:
@@ -143,10 +146,8 @@ def whole_periods(sound: BoolArray, periods: int, settle: int = 0) -> Whole:
             if not sound[k, n]:
                 sources[k * samples + n - begin] = next(free) * samples + n
     flat = sound.ravel()
-    for row in range(
-        begin, first * samples
-    ):  # of the run-in: there may be none that is not used yet
-        if not flat[row]:
-            n = row % samples
-            sources[row - begin] = next(k for k in (*spare, *inside) if sound[k, n]) * samples + n
+    # of the run-in: there may be none that is not used yet
+    for row in own[: first * samples - begin][~flat[begin : first * samples]].tolist():
+        n = row % samples
+        sources[row - begin] = next(k for k in (*spare, *inside) if sound[k, n]) * samples + n
     return Whole(own, sources, flat)

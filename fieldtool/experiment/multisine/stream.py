@@ -14,12 +14,11 @@ from drives.errors import SafetyStopError
 from fieldtool.errors import LoopUnstableError, NotEnoughDataError
 from fieldtool.experiment.axes import Axes, sample_times
 from fieldtool.experiment.multisine.clipping import clipped_samples
-from fieldtool.experiment.multisine.excitation import Excitation
+from fieldtool.experiment.multisine.excitation import Excitation, IntArray
 from fieldtool.experiment.multisine.growth import Growth, GrowthWatch, out_of_band
 from fieldtool.experiment.multisine.passes import (
     AS_IT_CAME,
     BoolArray,
-    IntArray,
     Whole,
     sound_in_a_row,
     sound_rows,
@@ -162,9 +161,14 @@ class ExperimentStream:
         name = one.name + AS_IT_CAME
         why = f"{passes - one.periods} periods more, because cycles were late or samples missing"
         yield replace(
-            every, name=name, kind="other", period=None, complete=False, note=_both(every.note, why)
+            every,
+            name=name,
+            kind="other",
+            period=None,
+            complete=False,
+            note=_joined(every.note, why),
         )
-        note = _both(mended.note, _origin(whole, one))
+        note = _joined(mended.note, _origin(whole, one))
         yield replace(mended, position=position, torque=torque, note=note)
 
     def _experiment(self, part: _Part, capture: Capture, rows: IntArray, cut: str) -> Experiment:
@@ -190,7 +194,7 @@ class ExperimentStream:
             if offset is None
             else {f"{name}.torque_offset": offset[rows, k] for k, name in enumerate(names)},
             complete=part.complete,
-            note=_both(*notes),
+            note=_joined(*notes),
         )
 
     def _script(self) -> Generator[FloatArray | Targets, Capture, None]:
@@ -407,7 +411,7 @@ class ExperimentStream:
         return Targets(position, offset) if self._with_torque else position
 
 
-def _both(*notes: str) -> str:
+def _joined(*notes: str) -> str:
     return "; ".join(note for note in notes if note)
 
 
